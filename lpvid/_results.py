@@ -1,0 +1,34 @@
+"""How a computation ended: a value with advice in it, not an exception."""
+
+import equinox as eqx
+
+
+class Status(eqx.Enumeration):
+    """Outcome of a computation; an integer code under `jit` and `vmap`, a sentence when printed."""
+
+    successful = "Successful."
+    max_steps = (
+        "The iteration limit was reached before the tolerance. The result is the best seen. "
+        "Raise the limit, loosen the tolerance or give a better start."
+    )
+    nonfinite = (
+        "A non-finite number appeared. Look for non-finite samples, unstable starts or a badly "
+        "scaled problem."
+    )
+    ill_conditioned = (
+        "The data matrix is nearly rank deficient. The input excites too little, or order and "
+        "block rows are too large for this record: excite every input, or lower them."
+    )
+    unstable = (
+        "The estimated model is unstable. Ask for stabilisation, lower the order, or use "
+        "past outputs as instruments."
+    )
+    infinite_norm = (
+        "The system has a pole on the stability boundary, so its norm is infinite. Remove the "
+        "marginal mode or add damping."
+    )
+
+
+def is_successful(status: Status):
+    """Whether a status says success (a boolean array under `jit` and `vmap`)."""
+    return status == Status.successful

@@ -1,0 +1,30 @@
+"""Shapes and dtypes enforced, float64 everywhere, measured data found or skipped."""
+
+import os
+from pathlib import Path
+
+# One BLAS thread per test process: the suite itself runs in parallel.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import jax
+from jaxtyping import install_import_hook
+
+_hook = install_import_hook("lpvid", "beartype.beartype")
+
+import lpvid  # noqa: E402, F401
+import pytest  # noqa: E402
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def measured_data() -> Path:
+    """Folder of the measured records, or a skip that says where they were looked for."""
+    folder = Path(os.environ.get("LPVID_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"measured data not found in {folder}; set LPVID_DATA to its folder")
+    return folder
