@@ -1,6 +1,7 @@
 """How a computation ended: a value with advice in it, not an exception."""
 
 import equinox as eqx
+from jaxtyping import Array, Float, Int
 
 
 class Status(eqx.Enumeration):
@@ -27,8 +28,21 @@ class Status(eqx.Enumeration):
         "The system has a pole on the stability boundary, so its norm is infinite. Remove the "
         "marginal mode or add damping."
     )
+    l_infinity = (
+        "The system is unstable: this is the L-infinity norm, the peak of its frequency response, not "
+        "an input-output gain. Stabilise the system if a gain is wanted."
+    )
 
 
 def is_successful(status: Status):
     """Whether a status says success (a boolean array under `jit` and `vmap`)."""
     return status == Status.successful
+
+
+class Solution(eqx.Module):
+    """Outcome of one minimisation: the best point seen, its cost, the status and the steps taken."""
+
+    value: Float[Array, " parameter"]
+    cost: Float[Array, ""]
+    status: Status
+    steps: Int[Array, ""]

@@ -1,0 +1,127 @@
+"""Minimisation: the one place that calls optimistix and jaxopt.
+
+Adds to them what every problem here needs: bounds (by a change of variables), the best point
+seen, one status enumeration, and several starts at once.
+"""
+
+import warnings
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from lpvid._results import Solution, Status
+
+with warnings.catch_warnings():
+    # Unmaintained but complete; its one warning on import is known.
+    warnings.filterwarnings("ignore", message="JAXopt is no longer maintained")
+    import jaxopt
+
+Parameters = Float[Array, " parameter"]
+
+
+class Bounds(eqx.Module):
+    """Lower and upper bounds, with the smooth change of variables that keeps within them.
+
+    A one-sided bound becomes an exponential, a two-sided one a logistic curve; a free parameter
+    stays itself.
+    """
+
+    lower: Parameters
+    upper: Parameters
+
+    def free(self, bounded: Parameters) -> Parameters:
+        """Unbounded coordinates of a point, which is first moved just inside the bounds."""
+        low, high, has_low, has_high = self._finite()
+        margin = 1e-8 * jnp.where(has_low & has_high, high - low, jnp.maximum(jnp.abs(bounded), 1.0))
+        inside = jnp.where(has_low, jnp.maximum(bounded, low + margin), bounded)
+        inside = jnp.where(has_high, jnp.minimum(inside, high - margin), inside)
+        share = jnp.where(has_low & has_high, (inside - low) / (high - low), 0.5)
+        both = jnp.log(share) - jnp.log1p(-share)
+        above = jnp.log(jnp.where(has_low, inside - low, 1.0))
+        below = -jnp.log(jnp.where(has_high, high - inside, 1.0))
+        one = jnp.where(has_low, above, jnp.where(has_high, below, inside))
+        return jnp.where(has_low & has_high, both, one)
+
+    def bounded(self, free: Parameters) -> Parameters:
+        """The point within the bounds that has these unbounded coordinates."""
+        low, high, has_low, has_high = self._finite()
+        both = low + (high - low) * jax.nn.sigmoid(free)
+        # Exponentials only where they are used: elsewhere they could overflow and poison gradients.
+        above = low + jnp.exp(jnp.where(has_low & ~has_high, free, 0.0))
+        below = high - jnp.exp(-jnp.where(has_high & ~has_low, free, 0.0))
+        one = jnp.where(has_low, above, jnp.where(has_high, below, free))
+        return jnp.where(has_low & has_high, both, one)
+
+    def _finite(self):
+        has_low, has_high = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
+        low = jnp.where(has_low, self.lower, 0.0)
+        # A width of one where there are no two bounds keeps the unused branch finite.
+        high = jnp.where(has_high, self.upper, low + 1.0)
+        return low, high, has_low, has_high
+
+
+def _status(result, cost) -> Status:
+    ended = Status.where(
+        result == optx.RESULTS.successful, Status.successful, Status.max_steps
+    )
+    return Status.where(jnp.isfinite(cost), ended, Status.nonfinite)
+
+
+def least_squares(
+    residual: Callable[[Parameters], Array],
+    start: Parameters,
+    *,
+    max_steps: int = 80,
+    tolerance: float = 1e-8,
+) -> Solution:
+    """Minimise ½‖residual(x)‖² by Levenberg–Marquardt from one start; never raises.
+
+    The Jacobian is taken in forward mode. Use `jax.vmap` over `start` for several starts.
+    """
+    solver = optx.BestSoFarLeastSquares(
+        optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.QR())
+    )
+    solution = optx.least_squares(
+        lambda x, _: residual(x),
+        solver,
+        start,
+        max_steps=max_steps,
+        throw=False,
+        adjoint=optx.ImplicitAdjoint(),
+    )
+    cost = 0.5 * jnp.sum(residual(solution.value) ** 2)
+    return Solution(
+        value=solution.value,
+        cost=jnp.where(jnp.isfinite(cost), cost, jnp.inf),
+        status=_status(solution.result, cost),
+        steps=jnp.asarray(solution.stats["num_steps"]),
+    )
+
+
+def minimise(
+    loss: Callable[[Parameters], Float[Array, ""]],
+    start: Parameters,
+    *,
+    max_steps: int = 50,
+    tolerance: float = 1e-9,
+) -> Solution:
+    """Minimise a smooth function by L-BFGS (zoom line search) from one start; never raises."""
+    solver = jaxopt.LBFGS(loss, maxiter=max_steps, tol=tolerance, history_size=12, jit=True)
+    value, state = solver.run(start)
+    cost, first = loss(value), loss(start)
+    # A line search that fails may leave a worse point than it came from.
+    better = jnp.isfinite(cost) & (cost <= first)
+    value = jnp.where(better, value, start)
+    cost = jnp.where(better, cost, first)
+    ended = Status.where(state.error <= tolerance, Status.successful, Status.max_steps)
+    return Solution(
+        value=value,
+        cost=jnp.where(jnp.isfinite(cost), cost, jnp.inf),
+        status=Status.where(jnp.isfinite(cost), ended, Status.nonfinite),
+        steps=jnp.asarray(state.iter_num),
+    )

@@ -1,0 +1,152 @@
+"""What the user passes as a signal, made a list of time-major float64 records, or refused."""
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+# One array, or a list with one array a record.
+Signals: TypeAlias = ArrayLike | Sequence[Any]
+
+# A one-dimensional kappa that does not match the record is read as a constant operating point only
+# if it is this short; a longer one is far more likely a time series of the wrong length.
+_LONGEST_OPERATING_POINT = 16
+
+
+def as_records(signal: Signals, argument: str) -> list[Float[Array, "time channel"]]:
+    """Split a public argument into records `(time, channel)`; raise on ambiguous shapes."""
+    if isinstance(signal, list | tuple):
+        if len(signal) == 0:
+            raise ValueError(f"{argument} is empty: give one array, or one array for each record.")
+        if any(isinstance(entry, list | tuple) for entry in signal):
+            raise ValueError(
+                f"{argument} is a nested list, which could mean records or rows: wrap it in "
+                f"numpy.asarray for one record, or give a list of arrays for several records."
+            )
+        if all(np.ndim(entry) == 0 for entry in signal):
+            return [_as_record(_as_float(signal, argument), argument)]
+        return [
+            _as_record(_as_float(entry, f"{argument}[{index}]"), f"{argument}[{index}]")
+            for index, entry in enumerate(signal)
+        ]
+    array = _as_float(signal, argument)
+    if array.ndim == 3:
+        if array.shape[0] == 0:
+            raise ValueError(
+                f"{argument} has shape {array.shape}, so no record: give at least one."
+            )
+        return [_as_record(array[index], f"{argument}[{index}]") for index in range(len(array))]
+    return [_as_record(array, argument)]
+
+
+def as_scheduling(kappa: Signals, lengths: tuple[int, ...]) -> list[Float[Array, "time nk"]]:
+    """Scheduling records `(time, nk)` of the given lengths; constants are broadcast over time."""
+    several = len(lengths) > 1
+    if isinstance(kappa, list | tuple) and any(np.ndim(entry) > 0 for entry in kappa):
+        entries = list(kappa)
+    elif several and np.ndim(kappa) > 0:
+        array = _as_float(kappa, "kappa")
+        entries = [array[index] for index in range(array.shape[0])]
+    elif several:
+        entries = [kappa] * len(lengths)
+    else:
+        array = _as_float(kappa, "kappa")
+        entries = list(array) if array.ndim == 3 else [array]
+    if len(entries) != len(lengths):
+        raise ValueError(
+            f"kappa has {len(entries)} entries along its first axis but there are {len(lengths)} "
+            f"records: give a scalar for all, or one entry (constant or time series) a record."
+        )
+    return [
+        _as_schedule(_as_float(entry, "kappa"), length, f"kappa[{index}]" if several else "kappa")
+        for index, (entry, length) in enumerate(zip(entries, lengths, strict=True))
+    ]
+
+
+def check_finite(
+    signal: Float[Array, "time channel"],
+    argument: str,
+    names: tuple[str, ...],
+    lengths: tuple[int, ...],
+) -> None:
+    """Raise on the first non-finite sample; tracers have no values yet and pass."""
+    if isinstance(signal, jax.core.Tracer):
+        return
+    finite = np.isfinite(np.asarray(signal))
+    if finite.all():
+        return
+    row, column = (int(index) for index in np.argwhere(~finite)[0])
+    record = int(np.searchsorted(np.cumsum(lengths), row, side="right"))
+    sample = row - sum(lengths[:record])
+    where = f"sample {sample}" + (f" of record {record}" if len(lengths) > 1 else "")
+    raise ValueError(
+        f"{argument} is not finite: channel {names[column]!r}, {where} is "
+        f"{float(signal[row, column])}. Cut the record there, or interpolate the gap first."
+    )
+
+
+def _as_float(signal: Any, argument: str) -> Float[Array, "..."]:
+    if isinstance(signal, list | tuple) and any(isinstance(x, jax.Array) for x in signal):
+        signal = jnp.stack([jnp.asarray(x, float) for x in signal])
+    if not isinstance(signal, jax.Array):
+        # A mask hidden by conversion would pass made-up samples on; NaN is found and named.
+        if isinstance(signal, np.ma.MaskedArray):
+            signal = signal.astype(float).filled(np.nan)
+        signal = np.asarray(signal)
+        if signal.dtype.kind not in "biuf":
+            raise ValueError(
+                f"{argument} holds {signal.dtype} values: give real numbers (float arrays)."
+            )
+    elif jnp.issubdtype(signal.dtype, jnp.complexfloating):
+        raise ValueError(f"{argument} holds {signal.dtype} values: give real numbers.")
+    return jnp.asarray(signal, float)
+
+
+def _as_record(array: Float[Array, "..."], argument: str) -> Float[Array, "time channel"]:
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2:
+        raise ValueError(
+            f"{argument} has shape {array.shape}: a record is (time,) or (time, channel), and "
+            f"(record, time, channel) holds several records."
+        )
+    samples, channels = array.shape
+    if channels == 0:
+        raise ValueError(f"{argument} has shape {array.shape}, so no channel: give at least one.")
+    if samples < 2:
+        raise ValueError(
+            f"{argument} has {samples} sample(s) (shape {array.shape}): a record needs 2 or more. "
+            f"Signals are time-major (time, channel); transpose if time is the second axis."
+        )
+    if channels > samples:
+        raise ValueError(
+            f"{argument} has {channels} channels but only {samples} samples (shape "
+            f"{array.shape}): signals are time-major (time, channel); transpose it."
+        )
+    return array
+
+
+def _as_schedule(array: Float[Array, "..."], length: int, argument: str) -> Float[Array, "time nk"]:
+    if array.ndim == 2:
+        array = _as_record(array, argument)
+        if array.shape[0] != length:
+            raise ValueError(
+                f"{argument} has {array.shape[0]} samples but u has {length}: they must cover the "
+                f"same samples; cut the longer one."
+            )
+        return array
+    if array.ndim > 2:
+        raise ValueError(f"{argument} has shape {array.shape}: give (time, nk), (nk,) or a scalar.")
+    if array.ndim == 1 and array.shape[0] == length:
+        return array[:, None]
+    constant = jnp.atleast_1d(array)
+    if not 0 < constant.shape[0] <= _LONGEST_OPERATING_POINT:
+        raise ValueError(
+            f"{argument} has {constant.shape[0]} entries: neither the record's {length} samples "
+            f"nor a constant operating point (1 to {_LONGEST_OPERATING_POINT} entries). Cut it to "
+            f"the record, or give it as (time, nk)."
+        )
+    return jnp.broadcast_to(constant[None, :], (length, constant.shape[0]))

@@ -1,0 +1,125 @@
+"""Linear parameter-varying models: a structure whose parameters depend on the scheduling."""
+
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from lpvid.models._convert import c2d
+from lpvid.models._scheduling import PolynomialBasis
+from lpvid.models._simulate import simulate_time_varying
+from lpvid.models._state_space import StateSpace
+from lpvid.models._structures import AbstractStructure
+
+
+class LPVStateSpace(eqx.Module):
+    """ẋ = A(κ) x + B(κ) u, y = C(κ) x + D(κ) u with (A, B, C, D)(κ) = structure(ϑ(κ)).
+
+    ϑ(κ) is a linear combination of basis functions of the scheduling variable κ. With a
+    `FreeStructure`, or any structure affine in ϑ, the matrices themselves are polynomials in κ
+    (001, equation 35).
+
+    **Arguments**
+
+    - `structure`: ϑ → (A, B, C, D), in continuous time.
+    - `basis`: functions of κ, e.g. a `PolynomialBasis`.
+    - `coefficients`: shape (basis.size, structure.n_parameters).
+    - `kappa_low`, `kappa_high`: box around the points that the model was built from.
+    - `dt`: 0 for a continuous-time model (the only kind that interpolation makes).
+
+    **Example**
+
+        lpv = interpolate(models, kappas, Polynomial(degree=2))
+        y = lpv.simulate(u=u, kappa=kappa, dt=1e-3)
+        frozen = lpv.at(0.4)
+    """
+
+    structure: AbstractStructure
+    basis: PolynomialBasis
+    coefficients: Float[Array, "basis parameter"]
+    kappa_low: Float[Array, " scheduling"]
+    kappa_high: Float[Array, " scheduling"]
+    dt: float = eqx.field(static=True, default=0.0)
+
+    @property
+    def n_scheduling(self) -> int:
+        """Number of scheduling variables."""
+        return self.kappa_low.shape[0]
+
+    def parameters(self, kappa: ArrayLike) -> Float[Array, "*batch parameter"]:
+        """ϑ(κ) for κ of shape (…, n_scheduling); a scalar κ may be given plainly."""
+        return self.basis(self._schedule(kappa)) @ self.coefficients
+
+    def at(self, kappa: ArrayLike) -> StateSpace:
+        """The model frozen at one value of κ; warns outside the range it was built from."""
+        point = self._schedule(kappa)
+        if point.ndim != 1:
+            raise ValueError(
+                f"kappa: one point of {self.n_scheduling} values is needed, got shape "
+                f"{point.shape}; use jax.vmap(lpv.at) for several."
+            )
+        self._warn_outside(point)
+        return self.structure.matrices(self.parameters(point))
+
+    def is_inside(self, kappa: ArrayLike) -> Array:
+        """Whether κ lies within the box of the points that the model was built from."""
+        point = self._schedule(kappa)
+        slack = 1e-9 * (self.kappa_high - self.kappa_low)
+        low, high = self.kappa_low - slack, self.kappa_high + slack
+        return jnp.all(((point - low) >= 0) & ((high - point) >= 0), axis=-1)
+
+    def simulate(
+        self, *, u: ArrayLike, kappa: ArrayLike, dt: float, x0: ArrayLike | None = None
+    ) -> Float[Array, "time output"]:
+        """Response to u (time, n_inputs) along κ (time, n_scheduling), from x0 (zero).
+
+        Input and scheduling are held constant over each sample of `dt` seconds, for which the
+        frozen model is discretised exactly. Differentiable in the coefficients, u, κ and x0.
+
+        Raises `ValueError` for wrong shapes; warns where κ leaves the range of the model.
+        """
+        u = jnp.asarray(u, float)
+        u = u[:, None] if u.ndim == 1 else u
+        schedule = self._schedule(kappa)
+        if schedule.shape[0] != u.shape[0] or schedule.ndim != 2:
+            raise ValueError(
+                f"kappa: {u.shape[0]} samples of {self.n_scheduling} values are needed, one for "
+                f"each sample of u; got shape {schedule.shape}."
+            )
+        self._warn_outside(schedule)
+        return self._simulate(u, schedule, float(dt), x0)
+
+    @eqx.filter_jit
+    def _simulate(self, u, schedule, dt, x0):
+        frozen = jax.vmap(self.structure.matrices)(self.parameters(schedule))
+        discrete = jax.vmap(lambda system: c2d(system, dt))(frozen)
+        start = jnp.zeros(discrete.A.shape[-1]) if x0 is None else jnp.asarray(x0, float)
+        return simulate_time_varying(
+            discrete.A, discrete.B, discrete.C, discrete.D, u=u, x0=start
+        )
+
+    def _schedule(self, kappa: ArrayLike) -> Array:
+        """κ with a last axis of n_scheduling; a missing axis is added where that is no guess."""
+        point = jnp.asarray(kappa, float)
+        if self.n_scheduling == 1 and (point.ndim == 0 or point.shape[-1] != 1):
+            point = point[..., None]
+        if point.ndim == 0 or point.shape[-1] != self.n_scheduling:
+            raise ValueError(
+                f"kappa: the last axis must hold {self.n_scheduling} values, got shape {point.shape}."
+            )
+        return point
+
+    def _warn_outside(self, point: Array) -> None:
+        if isinstance(point, jax.core.Tracer) or isinstance(self.kappa_low, jax.core.Tracer):
+            return
+        share = float(np.mean(~np.asarray(self.is_inside(point))))
+        if share > 0:
+            warnings.warn(
+                f"kappa: {100 * share:.3g} % of the points lie outside the range "
+                f"{np.asarray(self.kappa_low)} to {np.asarray(self.kappa_high)} that the model was "
+                "built from; it extrapolates there.",
+                stacklevel=3,
+            )

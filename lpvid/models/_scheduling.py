@@ -1,0 +1,74 @@
+"""Functions of the scheduling variable: the bases that LPV parameters are expanded in."""
+
+import itertools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+
+class Polynomial(eqx.Module):
+    """Polynomial dependence on κ, up to a total degree (001, equation 35).
+
+    **Arguments**
+
+    - `degree`: total degree, 0 or more; or `"auto"`, chosen by leaving one point out.
+
+    **Example**
+
+        lpv = interpolate(models, kappas, Polynomial(degree=2))
+    """
+
+    degree: int | str = eqx.field(static=True, default=2)
+
+    def __check_init__(self):
+        if self.degree != "auto" and not (isinstance(self.degree, int) and self.degree >= 0):
+            raise ValueError(f"degree: a whole number from 0 or 'auto' is needed, got {self.degree!r}.")
+
+
+class PolynomialBasis(eqx.Module):
+    """The monomials of κ up to a total degree, in κ centred and scaled to [−1, 1].
+
+    Centring keeps the least-squares problem well conditioned; `monomials` gives the
+    exponents, so that coefficients of plain powers can be worked out.
+    """
+
+    centre: Float[Array, " scheduling"]
+    half_range: Float[Array, " scheduling"]
+    exponents: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """Number of basis functions."""
+        return len(self.exponents)
+
+    def __call__(self, kappa: ArrayLike) -> Float[Array, "*batch basis"]:
+        """Values of all basis functions at κ, shape (…, n_scheduling) → (…, size)."""
+        scaled = (jnp.asarray(kappa, float) - self.centre) / self.half_range
+        columns = [
+            jnp.prod(
+                jnp.stack([scaled[..., k] ** power for k, power in enumerate(powers)], axis=-1),
+                axis=-1,
+            )
+            for powers in self.exponents
+        ]
+        return jnp.stack(columns, axis=-1)
+
+
+def polynomial_basis(kappas: ArrayLike, degree: int) -> PolynomialBasis:
+    """The polynomial basis for points `kappas` (n_points, n_scheduling) up to a total degree."""
+    points = np.asarray(kappas, float)
+    low, high = points.min(axis=0), points.max(axis=0)
+    half_range = np.where(high > low, (high - low) / 2, 1.0)
+    exponents = [
+        powers
+        for powers in itertools.product(range(degree + 1), repeat=points.shape[1])
+        if sum(powers) <= degree
+    ]
+    exponents.sort(key=lambda powers: (sum(powers), tuple(-p for p in powers)))
+    return PolynomialBasis(
+        centre=jnp.asarray((low + high) / 2),
+        half_range=jnp.asarray(half_range),
+        exponents=tuple(exponents),
+    )

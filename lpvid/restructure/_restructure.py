@@ -1,0 +1,261 @@
+"""Restructuring: from a black box to a structured model by the H∞ norm (001, section 2)."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
+
+from lpvid._results import Solution, Status
+from lpvid.models import AbstractStructure, StateSpace, d2c
+from lpvid.restructure._matching import Target, make_target, match_from_starts
+from lpvid.restructure._surrogate import refine_smooth
+
+# Two searches ended in the same minimum if their costs differ by less than this factor.
+_SAME_MINIMUM = 1.02
+
+
+class HinfMatching(eqx.Module):
+    """How to restructure: least squares on the response, then L-BFGS on smooth surrogates.
+
+    **Arguments**
+
+    - `frequencies`: size of the logarithmic grid (the poles' frequencies are added to it).
+    - `match_steps`: Levenberg–Marquardt steps from each start.
+    - `log2_powers`: exponents of the surrogate, round after round, as powers of two.
+    - `descent_steps`: L-BFGS steps of each round.
+    - `n_peaks`: peaks of the difference that are added to the grid in each round.
+    """
+
+    frequencies: int = eqx.field(static=True, default=60)
+    match_steps: int = eqx.field(static=True, default=80)
+    log2_powers: tuple[int, ...] = eqx.field(static=True, default=(1, 3, 5, 7))
+    descent_steps: int = eqx.field(static=True, default=60)
+    n_peaks: int = eqx.field(static=True, default=6)
+
+    def __check_init__(self):
+        for name in ("frequencies", "match_steps", "descent_steps", "n_peaks"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: at least 1 is needed, got {getattr(self, name)}.")
+
+
+class Restructured(eqx.Module):
+    """A structured model and how sure one can be of it.
+
+    - `parameters`: ϑ, in the order of `structure.parameter_names`.
+    - `model`: the structured `StateSpace` at ϑ, continuous time.
+    - `error_norm`: ‖G(ϑ) − G_i‖∞ (L∞ where a pole is unstable); `cost` is its square, F(ϑ).
+    - `peak_frequency`: where the norm is reached, rad/s.
+    - `match_costs`: least-squares cost that each start ended with, sorted.
+    - `hits`: how many starts ended in the best minimum; `margin`: cost of the next distinct
+      minimum over the best one (infinite where there is none).
+    - `history`: norm at the start of the surrogate stage and after each of its rounds.
+    """
+
+    structure: AbstractStructure
+    parameters: Float[Array, "*batch parameter"]
+    error_norm: Float[Array, "*batch"]
+    peak_frequency: Float[Array, "*batch"]
+    match_costs: Float[Array, "*batch start"]
+    hits: Int[Array, "*batch"]
+    margin: Float[Array, "*batch"]
+    history: Float[Array, "*batch round"]
+    status: Status
+
+    @property
+    def model(self) -> StateSpace:
+        """The structured model."""
+        build = self.structure.matrices
+        for _ in range(self.parameters.ndim - 1):
+            build = jax.vmap(build)
+        return build(self.parameters)
+
+    @property
+    def cost(self) -> Float[Array, "*batch"]:
+        """F(ϑ) = ‖G(ϑ) − G_i‖∞² (001, equation 6)."""
+        return self.error_norm**2
+
+
+def restructure(
+    black_box: StateSpace,
+    structure: AbstractStructure,
+    *,
+    starts: int = 24,
+    key: PRNGKeyArray | None = None,
+    initial: ArrayLike | None = None,
+    omega: ArrayLike | None = None,
+    method: HinfMatching | None = None,
+) -> Restructured:
+    """Find ϑ that minimises F(ϑ) = ‖G(s, ϑ) − G_i(s)‖∞² (001, equation 6).
+
+    The basis of the black box drops out. Levenberg–Marquardt on the frequency response runs
+    from every start in one batch; L-BFGS on a smooth surrogate with growing exponent follows
+    from the best. The result is a local minimum of a non-convex function: `hits` and `margin`
+    tell how the starts agreed.
+
+    **Arguments**
+
+    - `black_box`: continuous-time model; a discrete one is converted by `d2c` (zero-order hold).
+    - `structure`: what to look for.
+    - `starts`: how many starts the structure's start rule gives; 0 to use `initial` alone.
+    - `key`: random key of the start rule (needed where `starts` > 0).
+    - `initial`: further starting vectors, shape (n_parameters,) or (count, n_parameters), such
+      as a neighbour's solution.
+    - `omega`: match at these frequencies only (rad/s), to the black box's own response there,
+      a discrete one's at e^{jωT}: the right target for band-limited (multisine) records, whose
+      models say nothing about other frequencies. The norm is then the largest singular value
+      on this grid.
+    - `method`: options of the stages.
+
+    Raises `ValueError` for sizes that do not fit, a missing key, or no start at all. Works
+    under `jax.jit` and `jax.vmap` in `black_box` where the start rule does; not meant to be
+    differentiated (use the implicit function theorem on the result).
+
+    **Example**
+
+        best = restructure(fit.model, structure, starts=24, key=jax.random.key(0))
+        best.parameters, best.cost, best.hits
+    """
+    method = HinfMatching() if method is None else method
+    continuous = _continuous(black_box)
+    _check_sizes(continuous, structure)
+    highest = np.pi / black_box.dt if black_box.dt > 0 else np.inf
+    search = structure.search_structure() or structure
+    scattered = None
+    if starts > 0:
+        if key is None:
+            raise ValueError("key: the start rule is random; give key=jax.random.key(seed).")
+        scattered = search.starts(key, starts, continuous)
+    given = _initial(initial, structure)
+    if scattered is None and given is None:
+        raise ValueError("starts: none left; ask for starts > 0 or give initial=.")
+    if omega is None:
+        target = make_target(continuous, method.frequencies, highest)
+    else:
+        grid = _grid(omega, highest)
+        target = Target(grid, black_box.frequency_response(grid), None)
+    return _run(target, structure, search, scattered, given, method)
+
+
+def restructure_along(
+    black_boxes: Sequence[StateSpace],
+    structure: AbstractStructure,
+    *,
+    starts: int = 24,
+    key: PRNGKeyArray,
+    omega: ArrayLike | None = None,
+    method: HinfMatching | None = None,
+) -> list[Restructured]:
+    """Restructure the local models along κ: each one alone, then again from its neighbours.
+
+    A neighbour's solution replaces a point's own where it leads to a lower H∞ error, which mends
+    points whose starts all missed the global minimum. The models must be ordered along κ.
+
+    **Example**
+
+        local = restructure_along(models, structure, key=jax.random.key(0))
+    """
+    method = HinfMatching() if method is None else method
+    keys = jax.random.split(key, len(black_boxes))
+    found = [
+        restructure(model, structure, starts=starts, key=point_key, omega=omega, method=method)
+        for model, point_key in zip(black_boxes, keys, strict=True)
+    ]
+    if len(found) < 2:
+        return found
+    improved = []
+    for index, (model, own) in enumerate(zip(black_boxes, found, strict=True)):
+        left, right = max(index - 1, 0), min(index + 1, len(found) - 1)
+        neighbours = jnp.stack([found[left].parameters, found[right].parameters])
+        again = restructure(
+            model, structure, starts=0, initial=neighbours, omega=omega, method=method
+        )
+        better = bool(again.error_norm < (1.0 - 1e-3) * own.error_norm)
+        improved.append(again if better else own)
+    return improved
+
+
+@eqx.filter_jit
+def _run(target, structure, search, scattered, given, method) -> Restructured:
+    candidates, costs = [], []
+    if scattered is not None:
+        found = match_from_starts(search, scattered, target, method.match_steps)
+        costs.append(found.cost)
+        best = found.value[jnp.argmin(found.cost)]
+        candidates.append(structure.from_search(best)[None])
+    if given is not None:
+        candidates.append(given)
+    polished: Solution = match_from_starts(
+        structure, jnp.concatenate(candidates), target, method.match_steps
+    )
+    costs.append(polished.cost)
+    winner = jnp.argmin(polished.cost)
+    descent = refine_smooth(
+        structure,
+        polished.value[winner],
+        target,
+        log2_powers=method.log2_powers,
+        steps=method.descent_steps,
+        n_peaks=method.n_peaks,
+    )
+    # Hits are counted where the search was made: the polished point is one more trial.
+    searched = jnp.sort(costs[0])
+    same = searched <= _SAME_MINIMUM * searched[0] + 1e-16
+    others = jnp.where(same, jnp.inf, searched)
+    return Restructured(
+        structure=structure,
+        parameters=descent.value,
+        error_norm=descent.error_norm,
+        peak_frequency=descent.peak,
+        match_costs=searched,
+        hits=jnp.sum(same),
+        margin=jnp.min(others) / jnp.maximum(searched[0], 1e-300),
+        history=descent.history,
+        status=Status.where(
+            jnp.isfinite(descent.error_norm), Status.successful, Status.nonfinite
+        ),
+    )
+
+
+def _continuous(black_box: StateSpace) -> StateSpace:
+    return d2c(black_box) if black_box.dt > 0 else black_box
+
+
+def _check_sizes(black_box: StateSpace, structure: AbstractStructure) -> None:
+    sample = jax.eval_shape(
+        structure.matrices, jax.ShapeDtypeStruct((structure.n_parameters,), jnp.float64)
+    )
+    wanted = (sample.C.shape[0], sample.B.shape[1])
+    given = (black_box.ny, black_box.nu)
+    if wanted != given:
+        raise ValueError(
+            f"structure: it has {wanted[0]} outputs and {wanted[1]} inputs, the black box "
+            f"{given[0]} and {given[1]}; take the structure of the same plant."
+        )
+
+
+def _grid(omega: ArrayLike, highest: float) -> Float[Array, " frequency"]:
+    grid = jnp.atleast_1d(jnp.asarray(omega, float))
+    if grid.ndim != 1 or not bool(jnp.all((grid >= 0) & (grid <= highest * (1 + 1e-9)))):
+        raise ValueError(
+            f"omega: frequencies from 0 to the Nyquist frequency ({highest:.4g} rad/s) are needed "
+            "in a one-dimensional array."
+        )
+    return grid
+
+
+def _initial(initial: ArrayLike | None, structure: AbstractStructure) -> Array | None:
+    if initial is None:
+        return None
+    vectors = jnp.asarray(initial, float)
+    vectors = vectors[None] if vectors.ndim == 1 else vectors
+    if vectors.ndim != 2 or vectors.shape[1] != structure.n_parameters:
+        raise ValueError(
+            f"initial: vectors of {structure.n_parameters} parameters are needed, got shape "
+            f"{vectors.shape}; see structure.parameter_names."
+        )
+    return vectors
+
+
