@@ -48,10 +48,9 @@ def modal_form(
     D: Float[Array, "ny nu"],
 ) -> Modal:
     """Diagonalise A. Where it is defective the result is garbage and `conditioning` is huge."""
-    nx, nu = B.shape
+    nx = A.shape[0]
     poles, vectors = jnp.linalg.eig(A)
-    # A tiny shift-free solve: an exactly singular eigenvector matrix gives inf or NaN, which the
-    # conditioning below turns into "do not use".
+    # An exactly singular eigenvector matrix gives infinities, which `trustworthy` refuses.
     inputs = jnp.linalg.solve(vectors, B.astype(vectors.dtype))
     outputs = (C.astype(vectors.dtype) @ vectors).T
     residues = (outputs[:, :, None] * inputs[:, None, :]).reshape(nx, -1)
@@ -59,7 +58,6 @@ def modal_form(
     growth = jnp.sqrt(nx * jnp.sum(jnp.abs(inputs) ** 2))
     size = jnp.sqrt(jnp.sum(B * B))
     conditioning = jnp.where(size > 0.0, growth / jnp.where(size > 0.0, size, 1.0), 1.0)
-    del nu
     return Modal(poles, inputs, outputs, residues, D, conditioning)
 
 
@@ -153,12 +151,17 @@ def _closed_form_jet(G, dG, ddG):
     """The jet of the larger root of the 2 x 2 characteristic polynomial (or of |G|^2)."""
     column = jnp.sum(G.real**2 + G.imag**2, axis=1)
     slope = 2.0 * jnp.sum(G.real * dG.real + G.imag * dG.imag, axis=1)
-    bend = 2.0 * jnp.sum(
-        dG.real**2 + dG.imag**2 + G.real * ddG.real + G.imag * ddG.imag, axis=1
-    )
+    bend = 2.0 * jnp.sum(dG.real**2 + dG.imag**2 + G.real * ddG.real + G.imag * ddG.imag, axis=1)
     if G.shape[-1] == 1:
         return column[:, 0], slope[:, 0], bend[:, 0]
-    x, y, dx, dy, ddx, ddy = G[:, :, 0], G[:, :, 1], dG[:, :, 0], dG[:, :, 1], ddG[:, :, 0], ddG[:, :, 1]
+    x, y, dx, dy, ddx, ddy = (
+        G[:, :, 0],
+        G[:, :, 1],
+        dG[:, :, 0],
+        dG[:, :, 1],
+        ddG[:, :, 0],
+        ddG[:, :, 1],
+    )
     b = jnp.sum(x.conj() * y, axis=1)
     db = jnp.sum(dx.conj() * y + x.conj() * dy, axis=1)
     ddb = jnp.sum(ddx.conj() * y + 2.0 * (dx.conj() * dy) + x.conj() * ddy, axis=1)
@@ -173,8 +176,7 @@ def _closed_form_jet(G, dG, ddG):
         - droot**2
     ) / safe
     return tuple(
-        0.5 * (v[:, 0] + v[:, 1] + w)
-        for v, w in ((column, root), (slope, droot), (bend, ddroot))
+        0.5 * (v[:, 0] + v[:, 1] + w) for v, w in ((column, root), (slope, droot), (bend, ddroot))
     )
 
 
@@ -200,7 +202,9 @@ def refine_peaks(
         jet = squared_gain_jet(form, trial)
         better = jet[0] > gain
         omega = jnp.where(better, trial, omega)
-        kept = tuple(jnp.where(better, new, old) for new, old in zip(jet, (gain, slope, bend), strict=True))
+        kept = tuple(
+            jnp.where(better, new, old) for new, old in zip(jet, (gain, slope, bend), strict=True)
+        )
         width = jnp.where(better, 2.0 * width, 0.25 * jnp.abs(step))
         return omega, width, kept
 
@@ -213,3 +217,11 @@ def trustworthy(form: Modal) -> Bool[Array, ""]:
     """Whether the partial fractions keep at least about eleven digits."""
     finite = jnp.all(jnp.isfinite(form.residues.real)) & jnp.all(jnp.isfinite(form.residues.imag))
     return finite & (form.conditioning < 1e5)
+
+
+def rounding(form: Modal) -> Scalar:
+    """Size of the gain's rounding errors: below it nothing can be told apart from zero."""
+    size = jnp.sqrt(jnp.sum(form.residues.real**2 + form.residues.imag**2, axis=1))
+    rate = jnp.abs(form.poles.real)
+    noise = jnp.sum(size / jnp.where(rate > 0.0, rate, 1.0))
+    return 1e-15 * jnp.where(trustworthy(form), noise, 0.0)

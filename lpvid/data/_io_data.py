@@ -1,18 +1,27 @@
 """Measured or simulated records: inputs, outputs, scheduling, sample time."""
 
-import math
 import operator
 from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from lpvid.data._labels import Labels, channel_labels, positions
-from lpvid.data._signals import Signals, as_records, as_scheduling, check_finite
+from lpvid.data._signals import (
+    Samples,
+    Signals,
+    as_records,
+    as_scheduling,
+    check_finite,
+    common_lengths,
+    sample_time,
+    split_records,
+    stack_records,
+)
 
 
 class IOData(eqx.Module):
@@ -73,22 +82,22 @@ class IOData(eqx.Module):
         units: Labels | None = None,
     ):
         inputs, outputs = as_records(u, "u"), as_records(y, "y")
-        self.lengths = _common_lengths(inputs, outputs)
-        self.u, self.y = _stack(inputs, "u"), _stack(outputs, "y")
-        self.kappa = None if kappa is None else _stack(as_scheduling(kappa, self.lengths), "kappa")
-        self.dt = _sample_time(dt)
-        nk = 0 if self.kappa is None else self.kappa.shape[1]
-        counts = {"u": self.u.shape[1], "y": self.y.shape[1], "kappa": nk}
-        self.input_names, self.output_names, self.scheduling_names = channel_labels(
-            names, "names", counts
-        )
+        self.lengths = common_lengths(inputs, outputs)
+        stacked = {"u": stack_records(inputs, "u"), "y": stack_records(outputs, "y")}
+        if kappa is not None:
+            stacked["kappa"] = stack_records(as_scheduling(kappa, self.lengths), "kappa")
+        self.dt = sample_time(dt)
+        counts = {"u": 0, "y": 0, "kappa": 0}
+        counts.update({key: signal.shape[1] for key, signal in stacked.items()})
+        labels = channel_labels(names, "names", counts)
+        self.input_names, self.output_names, self.scheduling_names = labels
         self.input_units, self.output_units, self.scheduling_units = channel_labels(
             units, "units", counts
         )
-        check_finite(self.u, "u", self.input_names, self.lengths)
-        check_finite(self.y, "y", self.output_names, self.lengths)
-        if self.kappa is not None:
-            check_finite(self.kappa, "kappa", self.scheduling_names, self.lengths)
+        for (key, signal), channels in zip(stacked.items(), labels, strict=False):
+            check_finite(signal, key, channels, self.lengths)
+        self.u, self.y = jnp.asarray(stacked["u"]), jnp.asarray(stacked["y"])
+        self.kappa = jnp.asarray(stacked["kappa"]) if kappa is not None else None
 
     # Counts come from static fields: they hold under `vmap` and for leaves that are no arrays.
     @property
@@ -124,7 +133,7 @@ class IOData(eqx.Module):
     @property
     def time(self) -> Float[Array, " time"]:
         """Seconds since the start of the record each sample belongs to, `(time,)`."""
-        return self.dt * jnp.concatenate([jnp.arange(n, dtype=float) for n in self.lengths])
+        return jnp.asarray(np.concatenate([self.dt * np.arange(n) for n in self.lengths]))
 
     @property
     def records(self) -> tuple["IOData", ...]:
@@ -142,11 +151,12 @@ class IOData(eqx.Module):
         **Raises:** `ValueError` without `kappa`, for several records, and where `kappa` varies by
         more than rounding (1e-9 of its magnitude; not checked for tracers).
         """
-        if self.kappa is None:
+        kappa = self.kappa
+        if kappa is None:
             raise ValueError("operating_point: the data has no kappa; give kappa= to IOData.")
         self._require_single("operating_point")
         point = self.kappa[0]
-        if not isinstance(self.kappa, jax.core.Tracer):
+        if not isinstance(self.kappa, Tracer):
             values = np.asarray(self.kappa)
             spread = np.abs(values - values[0]).max(axis=0)
             varying = spread > 1e-9 * np.abs(values).max(axis=0)
@@ -220,7 +230,8 @@ class IOData(eqx.Module):
         }
 
         def take(signal, key):
-            return _pieces(signal[:, np.array(chosen[key], int)], self.lengths)
+            columns = np.array(chosen[key], int)
+            return [piece[:, columns] for piece in split_records(signal, self.lengths)]
 
         keeps_kappa = self.kappa is not None and len(chosen["kappa"]) > 0
         return IOData(
@@ -248,11 +259,11 @@ class IOData(eqx.Module):
         constructor takes it. Labels are kept for channels whose number does not change, and may
         be given in part: `names={"u": "torque"}`.
         """
-        inputs = _pieces(self.u, self.lengths) if u is None else self._as_records(u, "u")
-        outputs = _pieces(self.y, self.lengths) if y is None else self._as_records(y, "y")
-        lengths = _common_lengths(inputs, outputs)
+        inputs = split_records(self.u, self.lengths) if u is None else self._as_records(u, "u")
+        outputs = split_records(self.y, self.lengths) if y is None else self._as_records(y, "y")
+        lengths = common_lengths(inputs, outputs)
         if kappa is None:
-            scheduling = None if self.kappa is None else _pieces(self.kappa, self.lengths)
+            scheduling = None if self.kappa is None else split_records(self.kappa, self.lengths)
         else:
             scheduling = as_scheduling(self._unstacked(kappa), lengths)
         nk = 0 if scheduling is None else scheduling[0].shape[1]
@@ -278,17 +289,17 @@ class IOData(eqx.Module):
         several = len(self.lengths) > 1
         is_array = not isinstance(signal, list | tuple) and np.ndim(signal) in (1, 2)
         if several and is_array and np.shape(signal)[0] == self.n_samples:
-            return _pieces(signal, self.lengths)
+            return split_records(signal, self.lengths)
         return signal
 
-    def _as_records(self, signal: Signals, argument: str) -> list[Float[Array, "time channel"]]:
+    def _as_records(self, signal: Signals, argument: str) -> list[Samples]:
         return as_records(self._unstacked(signal), argument)
 
     def _cut(self, bounds: Sequence[tuple[int, int] | None]) -> "IOData":
         """The samples `(start, stop)` of each record; `None` leaves a record out."""
 
         def cut(signal):
-            pieces = zip(_pieces(signal, self.lengths), bounds, strict=True)
+            pieces = zip(split_records(signal, self.lengths), bounds, strict=True)
             return [piece[bound[0] : bound[1]] for piece, bound in pieces if bound is not None]
 
         return IOData(
@@ -313,96 +324,6 @@ class IOData(eqx.Module):
             f"IOData({size}, {_count(self.input_names, 'input')}, "
             f"{_count(self.output_names, 'output')}{kappa}, dt={self.dt:g} s)"
         )
-
-
-def join(parts: Sequence[IOData]) -> IOData:
-    """Several `IOData` as one, all their records in the order given.
-
-    **Raises:** `ValueError` unless all have the same sample time (to 1e-6 of it: measured time
-    stamps are not better), channel names and units, and all or none have `kappa`.
-
-    !!! example
-
-        ```python
-        both = join([low_amplitude, high_amplitude])
-        ```
-    """
-    parts = list(parts)
-    if not parts:
-        raise ValueError("join: no data given; give a list of one or more IOData.")
-    first = parts[0]
-    for number, part in enumerate(parts):
-        if not math.isclose(part.dt, first.dt, rel_tol=1e-6):
-            raise ValueError(
-                f"join: part {number} has dt={part.dt:.9g} s but part 0 has dt={first.dt:.9g} s; "
-                f"bring them to one sample time first."
-            )
-        for what, own, common in (
-            ("names", part.names, first.names),
-            ("units", part.units, first.units),
-        ):
-            if own != common:
-                raise ValueError(
-                    f"join: part {number} has the {what} {own} but part 0 has {common}; use "
-                    f"data.select, or data.replace({what}=...)."
-                )
-    kappas = [part.kappa for part in parts if part.kappa is not None]
-
-    def pieces(signals):
-        return [
-            piece
-            for signal, part in zip(signals, parts, strict=True)
-            for piece in _pieces(signal, part.lengths)
-        ]
-
-    return IOData(
-        u=pieces([part.u for part in parts]),
-        y=pieces([part.y for part in parts]),
-        # Equal scheduling names: either every part has kappa or none has.
-        kappa=pieces(kappas) if kappas else None,
-        dt=first.dt,
-        names=first.names,
-        units=first.units,
-    )
-
-
-def _pieces(signal: Any, lengths: tuple[int, ...]) -> list[Any]:
-    ends = np.cumsum(lengths).tolist()
-    return [signal[end - length : end] for length, end in zip(lengths, ends, strict=True)]
-
-
-def _stack(records: list[Float[Array, "_ channel"]], argument: str) -> Float[Array, "_ channel"]:
-    for number, record in enumerate(records):
-        if record.shape[1] != records[0].shape[1]:
-            raise ValueError(
-                f"{argument}[{number}] has {record.shape[1]} channel(s) but {argument}[0] has "
-                f"{records[0].shape[1]}: every record needs the same channels."
-            )
-    return records[0] if len(records) == 1 else jnp.concatenate(records)
-
-
-def _common_lengths(inputs: list[Array], outputs: list[Array]) -> tuple[int, ...]:
-    if len(inputs) != len(outputs):
-        raise ValueError(
-            f"y has {len(outputs)} record(s) but u has {len(inputs)}: give both for every record."
-        )
-    for number, (u, y) in enumerate(zip(inputs, outputs, strict=True)):
-        if u.shape[0] != y.shape[0]:
-            where = f" in record {number}" if len(inputs) > 1 else ""
-            raise ValueError(
-                f"y has {y.shape[0]} samples but u has {u.shape[0]}{where}: they must cover the "
-                f"same samples; cut the longer one."
-            )
-    return tuple(u.shape[0] for u in inputs)
-
-
-def _sample_time(dt: Any) -> float:
-    if isinstance(dt, jax.core.Tracer):
-        raise ValueError("dt is traced: it is static; pass a Python float from outside jit.")
-    dt = float(dt)
-    if not (math.isfinite(dt) and dt > 0):
-        raise ValueError(f"dt is {dt}: give the sample time in seconds, positive and finite.")
-    return dt
 
 
 def _chosen(wanted: str | Sequence[str] | None, names: tuple[str, ...], argument: str) -> list[int]:

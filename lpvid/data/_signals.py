@@ -1,22 +1,27 @@
 """What the user passes as a signal, made a list of time-major float64 records, or refused."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 # One array, or a list with one array a record.
 Signals: TypeAlias = ArrayLike | Sequence[Any]
+
+# Samples stay NumPy arrays until the record is complete: JAX would compile each slice and join anew
+# for each length. Only tracers, which have no samples yet, go through JAX.
+Samples: TypeAlias = Float[Array, "..."] | Float[np.ndarray, "..."]
 
 # A one-dimensional kappa that does not match the record is read as a constant operating point only
 # if it is this short; a longer one is far more likely a time series of the wrong length.
 _LONGEST_OPERATING_POINT = 16
 
 
-def as_records(signal: Signals, argument: str) -> list[Float[Array, "time channel"]]:
+def as_records(signal: Signals, argument: str) -> list[Samples]:
     """Split a public argument into records `(time, channel)`; raise on ambiguous shapes."""
     if isinstance(signal, list | tuple):
         if len(signal) == 0:
@@ -42,7 +47,7 @@ def as_records(signal: Signals, argument: str) -> list[Float[Array, "time channe
     return [_as_record(array, argument)]
 
 
-def as_scheduling(kappa: Signals, lengths: tuple[int, ...]) -> list[Float[Array, "time nk"]]:
+def as_scheduling(kappa: Signals, lengths: tuple[int, ...]) -> list[Samples]:
     """Scheduling records `(time, nk)` of the given lengths; constants are broadcast over time."""
     several = len(lengths) > 1
     if isinstance(kappa, list | tuple) and any(np.ndim(entry) > 0 for entry in kappa):
@@ -67,15 +72,15 @@ def as_scheduling(kappa: Signals, lengths: tuple[int, ...]) -> list[Float[Array,
 
 
 def check_finite(
-    signal: Float[Array, "time channel"],
+    signal: Samples,
     argument: str,
     names: tuple[str, ...],
     lengths: tuple[int, ...],
 ) -> None:
     """Raise on the first non-finite sample; tracers have no values yet and pass."""
-    if isinstance(signal, jax.core.Tracer):
+    if isinstance(signal, Tracer):
         return
-    finite = np.isfinite(np.asarray(signal))
+    finite = np.isfinite(signal)
     if finite.all():
         return
     row, column = (int(index) for index in np.argwhere(~finite)[0])
@@ -88,24 +93,71 @@ def check_finite(
     )
 
 
-def _as_float(signal: Any, argument: str) -> Float[Array, "..."]:
-    if isinstance(signal, list | tuple) and any(isinstance(x, jax.Array) for x in signal):
-        signal = jnp.stack([jnp.asarray(x, float) for x in signal])
-    if not isinstance(signal, jax.Array):
-        # A mask hidden by conversion would pass made-up samples on; NaN is found and named.
-        if isinstance(signal, np.ma.MaskedArray):
-            signal = signal.astype(float).filled(np.nan)
-        signal = np.asarray(signal)
-        if signal.dtype.kind not in "biuf":
+def split_records(signal: Any, lengths: tuple[int, ...]) -> list[Any]:
+    """Take a stacked signal apart into its records; NumPy views unless it is traced."""
+    signal = signal if isinstance(signal, Tracer) else np.asarray(signal)
+    ends = np.cumsum(lengths).tolist()
+    return [signal[end - length : end] for length, end in zip(lengths, ends, strict=True)]
+
+
+def stack_records(records: list[Samples], argument: str) -> Samples:
+    """Records one after the other, `(time, channel)`; they must have the same channels."""
+    for number, record in enumerate(records):
+        if record.shape[1] != records[0].shape[1]:
             raise ValueError(
-                f"{argument} holds {signal.dtype} values: give real numbers (float arrays)."
+                f"{argument}[{number}] has {record.shape[1]} channel(s) but {argument}[0] has "
+                f"{records[0].shape[1]}: every record needs the same channels."
             )
-    elif jnp.issubdtype(signal.dtype, jnp.complexfloating):
-        raise ValueError(f"{argument} holds {signal.dtype} values: give real numbers.")
-    return jnp.asarray(signal, float)
+    if len(records) == 1:
+        return records[0]
+    traced = any(isinstance(record, Tracer) for record in records)
+    return (jnp if traced else np).concatenate(records)
 
 
-def _as_record(array: Float[Array, "..."], argument: str) -> Float[Array, "time channel"]:
+def common_lengths(inputs: list[Samples], outputs: list[Samples]) -> tuple[int, ...]:
+    """Length of each record, equal for inputs and outputs."""
+    if len(inputs) != len(outputs):
+        raise ValueError(
+            f"y has {len(outputs)} record(s) but u has {len(inputs)}: give both for every record."
+        )
+    for number, (u, y) in enumerate(zip(inputs, outputs, strict=True)):
+        if u.shape[0] != y.shape[0]:
+            where = f" in record {number}" if len(inputs) > 1 else ""
+            raise ValueError(
+                f"y has {y.shape[0]} samples but u has {u.shape[0]}{where}: they must cover the "
+                f"same samples; cut the longer one."
+            )
+    return tuple(u.shape[0] for u in inputs)
+
+
+def sample_time(dt: Any) -> float:
+    """The sample time as a Python float, positive."""
+    if isinstance(dt, Tracer):
+        raise ValueError("dt is traced: it is static; pass a Python float from outside jit.")
+    dt = float(dt)
+    if not (math.isfinite(dt) and dt > 0):
+        raise ValueError(f"dt is {dt}: give the sample time in seconds, positive and finite.")
+    return dt
+
+
+def _as_float(given: Any, argument: str) -> Samples:
+    signal: Any = given
+    if isinstance(given, list | tuple) and any(isinstance(x, Tracer) for x in given):
+        signal = jnp.stack([jnp.asarray(x, float) for x in given])
+    if isinstance(signal, Tracer):
+        if jnp.issubdtype(signal.dtype, jnp.complexfloating):
+            raise ValueError(f"{argument} holds {signal.dtype} values: give real numbers.")
+        return jnp.asarray(signal, float)
+    # A mask lost in conversion would pass made-up samples on; NaN is found and named.
+    if isinstance(signal, np.ma.MaskedArray):
+        signal = np.ma.filled(signal.astype(float), np.nan)
+    array = np.asarray(signal)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{argument} holds {array.dtype} values: give an array of real numbers.")
+    return array.astype(float, copy=False)
+
+
+def _as_record(array: Samples, argument: str) -> Samples:
     if array.ndim == 1:
         array = array[:, None]
     if array.ndim != 2:
@@ -129,7 +181,7 @@ def _as_record(array: Float[Array, "..."], argument: str) -> Float[Array, "time 
     return array
 
 
-def _as_schedule(array: Float[Array, "..."], length: int, argument: str) -> Float[Array, "time nk"]:
+def _as_schedule(array: Samples, length: int, argument: str) -> Samples:
     if array.ndim == 2:
         array = _as_record(array, argument)
         if array.shape[0] != length:
@@ -142,11 +194,12 @@ def _as_schedule(array: Float[Array, "..."], length: int, argument: str) -> Floa
         raise ValueError(f"{argument} has shape {array.shape}: give (time, nk), (nk,) or a scalar.")
     if array.ndim == 1 and array.shape[0] == length:
         return array[:, None]
-    constant = jnp.atleast_1d(array)
+    constant = array[None] if array.ndim == 0 else array
     if not 0 < constant.shape[0] <= _LONGEST_OPERATING_POINT:
         raise ValueError(
             f"{argument} has {constant.shape[0]} entries: neither the record's {length} samples "
             f"nor a constant operating point (1 to {_LONGEST_OPERATING_POINT} entries). Cut it to "
             f"the record, or give it as (time, nk)."
         )
-    return jnp.broadcast_to(constant[None, :], (length, constant.shape[0]))
+    xp = jnp if isinstance(constant, Tracer) else np
+    return xp.broadcast_to(constant[None, :], (length, constant.shape[0]))

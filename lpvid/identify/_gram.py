@@ -73,9 +73,7 @@ def hankel_gram(
     # Zeros between the records keep the lagged products of one from reaching into the next.
     pieces = [w[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
     apart = (
-        w
-        if len(lengths) == 1
-        else jnp.concatenate([x for piece in pieces for x in (piece, gap)])
+        w if len(lengths) == 1 else jnp.concatenate([x for piece in pieces for x in (piece, gap)])
     )
     lagged = lagged_products(apart, n_lags)
     # R_{-τ} = R_τᵀ: one table over negative and positive lags.

@@ -1,5 +1,9 @@
 """Plants built from their energies, and what excites them."""
 
+from lpvid.mechanics._arm_structure import ArmScales as ArmScales
+from lpvid.mechanics._arm_structure import DissipativeTwoLinkArm as DissipativeTwoLinkArm
+from lpvid.mechanics._arm_structure import TwoLinkArmStructure as TwoLinkArmStructure
+from lpvid.mechanics._arm_structure import two_link_arm_structure as two_link_arm_structure
 from lpvid.mechanics._excitation import add_noise as add_noise
 from lpvid.mechanics._excitation import multisine as multisine
 from lpvid.mechanics._excitation import prbs as prbs

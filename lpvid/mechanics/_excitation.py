@@ -99,8 +99,9 @@ def multisine(
     phases = jax.random.uniform(key, (lines.size,), float, maxval=2.0 * np.pi)
     lines_per_channel = jnp.asarray(np.bincount(channels, minlength=n_channels), float)
     size = amplitude * n_samples / jnp.sqrt(2.0 * lines_per_channel[channels])
+    coefficients = jax.lax.complex(size * jnp.cos(phases), size * jnp.sin(phases))
     spectrum = jnp.zeros((n_samples // 2 + 1, n_channels), complex)
-    spectrum = spectrum.at[lines, channels].set(size * jnp.exp(1j * phases))
+    spectrum = spectrum.at[lines, channels].set(coefficients)
     return jnp.fft.irfft(spectrum, n=n_samples, axis=0)
 
 

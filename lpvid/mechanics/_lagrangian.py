@@ -67,15 +67,22 @@ def accelerations(
         Array([-0.48968275], dtype=float64)
     """
 
-    def lagrangian(q):
-        return kinetic_energy(q, velocities, params) - potential_energy(q, params)
+    dof = positions.shape[0]
 
-    def momenta(q):
-        return jax.grad(kinetic_energy, 1)(q, velocities, params)
+    def slopes(q, qd):
+        return jax.grad(kinetic_energy, (0, 1))(q, qd, params)
 
-    _, momentum_drift = jax.jvp(momenta, (positions,), (velocities,))
-    mass = inertia_matrix(kinetic_energy, positions, params)
-    return _cholesky_solve(mass, forces + jax.grad(lagrangian)(positions) - momentum_drift)
+    def directional(q_direction, qd_direction):
+        return jax.jvp(slopes, (positions, velocities), (q_direction, qd_direction))
+
+    # One pass for all of T's derivatives: along each velocity (the columns of M) and, last,
+    # along the motion (the momenta's drift); ∂T/∂q comes with it.
+    (push, _), (_, columns) = jax.vmap(directional, out_axes=(None, 0))(
+        jnp.concatenate([jnp.zeros((dof, dof)), velocities[None]]),
+        jnp.eye(dof + 1, dof),
+    )
+    right = forces + push - jax.grad(potential_energy)(positions, params) - columns[dof]
+    return _cholesky_solve(columns[:dof], right)
 
 
 def integrate(

@@ -1,11 +1,18 @@
 """Mass–spring–damper M ÿ + D ẏ + K y = u (Olofsson et al. 2014)."""
 
+from collections.abc import Sequence
+from typing import TypeAlias
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from lpvid.models import StateSpace
+
+Rows: TypeAlias = ArrayLike | Sequence[Sequence[float]]
 
 
 class Modes(eqx.Module):
@@ -43,19 +50,19 @@ class MassSpringDamper(eqx.Module):
     damping: Float[Array, "dof dof"]
     stiffness: Float[Array, "dof dof"]
 
-    def __init__(self, mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike):
+    def __init__(self, mass: Rows, damping: Rows, stiffness: Rows):
         self.mass = jnp.asarray(mass, float)
         self.damping = jnp.asarray(damping, float)
         self.stiffness = jnp.asarray(stiffness, float)
         for name, matrix in vars(self).items():
             if matrix.ndim != 2 or matrix.shape != self.mass.shape[:1] * 2:
                 raise ValueError(f"{name} has shape {matrix.shape}: give square matrices (n, n).")
-            if isinstance(matrix, jax.core.Tracer):
+            if isinstance(matrix, Tracer):
                 continue
-            scale = jnp.max(jnp.abs(matrix))
-            if jnp.max(jnp.abs(matrix - matrix.T)) > 1e-10 * scale:
+            numbers = np.asarray(matrix)
+            if np.abs(numbers - numbers.T).max() > 1e-10 * np.abs(numbers).max():
                 raise ValueError(f"{name} is not symmetric: give (X + X.T) / 2 if that is meant.")
-            if name == "mass" and not jnp.min(jnp.linalg.eigvalsh(matrix)) > 0.0:
+            if name == "mass" and not np.linalg.eigvalsh(numbers).min() > 0.0:
                 raise ValueError(
                     "mass is not positive definite: every direction needs inertia; "
                     "eliminate massless coordinates first."

@@ -230,7 +230,7 @@ def _sweep_experiment(
 ) -> tuple[Float[Array, "time 2"], Float[Array, ""]]:
     steps = n_samples // decimate
     # Mean velocity of the half cosine over each held sample: the held reference lands exactly.
-    progress = 0.5 * (1.0 - jnp.cos(jnp.pi * jnp.arange(steps + 1) / steps))
+    progress = 0.5 * (1.0 - jnp.cos(jnp.linspace(0.0, jnp.pi, steps + 1)))
     velocity = (ends[1] - ends[0]) * jnp.diff(progress) / (decimate * dt)
     crossing = jnp.repeat(velocity, decimate)
     reference = prbs(key, n_samples, 2, amplitude=amplitude, hold=hold)
@@ -265,10 +265,10 @@ def _sweep_data(motion, reference, dt, decimate) -> IOData:
 
 
 def _operating_points(theta2: Sequence[float]) -> Float[Array, " record"]:
-    points = jnp.asarray(theta2, float)
-    if points.ndim != 1 or not (jnp.all(points > 0.0) and jnp.all(points < jnp.pi)):
+    points = np.asarray(theta2, float)
+    if points.ndim != 1 or not (np.all(points > 0.0) and np.all(points < np.pi)):
         raise ValueError(f"theta2={theta2} must be a sequence of angles in (0, π), in radians.")
-    return points
+    return jnp.asarray(points)
 
 
 def _check_sampling(n_samples: int, decimate: int, hold: int) -> None:

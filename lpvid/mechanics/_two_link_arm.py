@@ -6,10 +6,13 @@ the second-order term of the arc length. Segment 1 is turned by θ1, segment 2 s
 is turned by θ12 = θ1 + θ2 + 2 ℓ1 v1.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from lpvid._results import Status
@@ -19,10 +22,12 @@ from lpvid.models import StateSpace
 # The squared velocity of a segment's point is a polynomial of degree 6 in x: four Gauss–Legendre
 # nodes are exact up to degree 7.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
-_UNIT_NODES, _UNIT_WEIGHTS = (_NODES + 1.0) / 2.0, _WEIGHTS / 2.0
+_WEIGHTS = _WEIGHTS / 2.0
+# Where a segment has mass, as a share of its length: the nodes, and the lumped mass at its tip.
+_STATIONS = np.append((_NODES + 1.0) / 2.0, 1.0)
 
 
-def _floats(values: ArrayLike) -> Array:
+def _floats(values: ArrayLike | Sequence[float]) -> Array:
     return jnp.asarray(values, float)
 
 
@@ -80,9 +85,11 @@ class TwoLinkFlexibleArm(eqx.Module):
             expected = () if name in ("joint_mass", "payload_mass") else (2,)
             if value.shape != expected:
                 raise ValueError(f"{name} has shape {value.shape}: give shape {expected}.")
-            if isinstance(value, jax.core.Tracer):
+            if isinstance(value, Tracer):
                 continue
-            if not jnp.all(value >= 0.0 if name in may_vanish else value > 0.0):
+            # NumPy, so that a constant arm can also be built inside of jit.
+            numbers = np.asarray(value)
+            if not np.all(numbers >= 0.0 if name in may_vanish else numbers > 0.0):
                 sign = "non-negative" if name in may_vanish else "positive"
                 raise ValueError(f"{name} is {value}: give {sign} numbers in SI units.")
 
@@ -93,25 +100,21 @@ class TwoLinkFlexibleArm(eqx.Module):
             >>> reference_two_link_arm().kinetic_energy(jnp.zeros(4), jnp.array([1.0, 0, 0, 0]))
             Array(0.19..., dtype=float64)
         """
-        _, theta2, v1, _ = q
-        rate1, rate2, deflection_rate1, _ = qd
         first, second = self.link_lengths
         # Velocities in each segment's own frame, so that θ1 drops out by construction.
-        turn, turn_rate = theta2 + 2.0 * first * v1, rate2 + 2.0 * first * deflection_rate1
-        spin1, spin2 = rate1, rate1 + turn_rate
-        beam1 = _point_velocities(first * _UNIT_NODES, q[2], qd[2], spin1)
-        tip1 = _point_velocities(first, q[2], qd[2], spin1)
+        turn, spin1 = q[1] + 2.0 * first * q[2], qd[0]
+        spin2 = spin1 + qd[1] + 2.0 * first * qd[2]
+        along1, across1 = _point_velocities(first * _STATIONS, q[2], qd[2], spin1)
+        along2, across2 = _point_velocities(second * _STATIONS, q[3], qd[3], spin2)
         cosine, sine = jnp.cos(turn), jnp.sin(turn)
-        base2 = (cosine * tip1[0] + sine * tip1[1], cosine * tip1[1] - sine * tip1[0])
-        beam2 = _point_velocities(second * _UNIT_NODES, q[3], qd[3], spin2)
-        tip2 = _point_velocities(second, q[3], qd[3], spin2)
+        along2 = along2 + (cosine * along1[-1] + sine * across1[-1])
+        across2 = across2 + (cosine * across1[-1] - sine * along1[-1])
         masses = self.linear_densities * self.link_lengths
+        masses1 = jnp.append(masses[0] * _WEIGHTS, self.joint_mass)
+        masses2 = jnp.append(masses[1] * _WEIGHTS, self.payload_mass)
         return 0.5 * (
-            masses[0] * jnp.sum(_UNIT_WEIGHTS * (beam1[0] ** 2 + beam1[1] ** 2))
-            + self.joint_mass * (tip1[0] ** 2 + tip1[1] ** 2)
-            + masses[1]
-            * jnp.sum(_UNIT_WEIGHTS * ((base2[0] + beam2[0]) ** 2 + (base2[1] + beam2[1]) ** 2))
-            + self.payload_mass * ((base2[0] + tip2[0]) ** 2 + (base2[1] + tip2[1]) ** 2)
+            masses1 @ (along1**2 + across1**2)
+            + masses2 @ (along2**2 + across2**2)
             + self.hub_inertias[0] * spin1**2
             + self.hub_inertias[1] * spin2**2
         )
@@ -222,7 +225,7 @@ class TwoLinkFlexibleArm(eqx.Module):
             theta2_start: second joint's angle at the start, in (0, π), rad.
             theta1_start: first joint's angle at the start, rad.
             substeps: Runge–Kutta steps per sample; at dt = 1e-4 s one is enough for the reference
-                arm (fastest pole −698/s at θ2 = π/2).
+                arm (fastest pole −727/s, at θ2 = π/8).
             every: keep every `every`-th sample.
 
         Returns:
@@ -238,24 +241,23 @@ class TwoLinkFlexibleArm(eqx.Module):
             >>> motion.y.shape
             (20, 2)
         """
-        reference = jnp.asarray(reference, float)
-        theta1_start, theta2_start = (
-            _floats(theta1_start),
-            _angle_inside(theta2_start, "theta2_start"),
-        )
+        reference, dt = _floats(reference), _floats(dt)
+        theta1_start = _floats(theta1_start)
+        theta2_start = _angle_inside(theta2_start, "theta2_start")
         if reference.ndim != 2 or reference.shape[1] != 2:
             raise ValueError(f"reference has shape {reference.shape}: give (time, 2).")
-        if not isinstance(dt, jax.core.Tracer) and not dt > 0.0:
+        if not isinstance(dt, Tracer) and not np.asarray(dt) > 0.0:
             raise ValueError(f"dt={dt} must be positive: give the sample time in seconds.")
-        return _simulate(
-            self, reference, jnp.asarray(dt, float), theta1_start, theta2_start, substeps, every
-        )
+        return _simulate(self, reference, dt, theta1_start, theta2_start, substeps, every)
 
     def linearised(self, theta2: ArrayLike) -> StateSpace:
         """Local model at rest at θ2, states [v1, v2, θ̇1, θ̇2, v̇1, v̇2] (equations 30–32).
 
         Exact, by autodiff of the nonlinear arm; the angles are dropped, because at rest nothing
         depends on them. Scheduling variable κ = cos θ2.
+
+        Raises:
+            ValueError: if `theta2` is not one angle in (0, π).
 
         Example:
             >>> reference_two_link_arm().linearised(jnp.pi / 2).poles().real.max()
@@ -266,11 +268,14 @@ class TwoLinkFlexibleArm(eqx.Module):
     def structured_parameters(self, theta2: ArrayLike) -> Float[Array, "16"]:
         """ϑ1…ϑ16 of equation 32 at θ2: A[2:6, 0:4] by columns, from M⁻¹, stiffness and gains.
 
+        Raises:
+            ValueError: if `theta2` is not one angle in (0, π).
+
         Example:
             >>> reference_two_link_arm().structured_parameters(jnp.pi / 2).shape
             (16,)
         """
-        return _structured_parameters(self, _floats(theta2))
+        return _structured_parameters(self, _angle_inside(theta2, "theta2"))
 
 
 def reference_two_link_arm() -> TwoLinkFlexibleArm:
@@ -352,7 +357,9 @@ def _turned(angle, point):
 
 def _angle_inside(theta2: ArrayLike, name: str) -> Array:
     theta2 = _floats(theta2)
-    if not isinstance(theta2, jax.core.Tracer) and not 0.0 < theta2 < jnp.pi:
+    if theta2.ndim:
+        raise ValueError(f"{name} has shape {theta2.shape}: give one angle, several by jax.vmap.")
+    if not isinstance(theta2, Tracer) and not 0.0 < np.asarray(theta2) < np.pi:
         raise ValueError(
             f"{name}={theta2} lies outside of (0, π), where the rigid arm with the same tip is "
             "unique: give an angle in radians inside."

@@ -1,3 +1,33 @@
 """State-space models, their simulation, conversion and structured parameterisations."""
 
+from lpvid.models._average import AbstractAverage as AbstractAverage
+from lpvid.models._average import AlignedAverage as AlignedAverage
+from lpvid.models._average import NaiveAverage as NaiveAverage
+from lpvid.models._average import align as align
+from lpvid.models._average import average as average
+from lpvid.models._convert import c2d as c2d
+from lpvid.models._convert import d2c as d2c
+from lpvid.models._exchange import from_control as from_control
+from lpvid.models._exchange import from_scipy as from_scipy
+from lpvid.models._exchange import to_control as to_control
+from lpvid.models._exchange import to_scipy as to_scipy
+from lpvid.models._frequency import frequency_response as frequency_response
+from lpvid.models._hold import AbstractConversion as AbstractConversion
+from lpvid.models._hold import Tustin as Tustin
+from lpvid.models._hold import ZeroOrderHold as ZeroOrderHold
+from lpvid.models._lpv import LPVStateSpace as LPVStateSpace
+from lpvid.models._mechanical_structure import MechanicalStructure as MechanicalStructure
+from lpvid.models._modal_structure import ModalStructure as ModalStructure
+from lpvid.models._realisations import balance as balance
+from lpvid.models._realisations import gramians as gramians
+from lpvid.models._realisations import modal_form as modal_form
+from lpvid.models._scheduling import Polynomial as Polynomial
+from lpvid.models._scheduling import PolynomialBasis as PolynomialBasis
+from lpvid.models._scheduling import polynomial_basis as polynomial_basis
+from lpvid.models._simulate import simulate as simulate
+from lpvid.models._simulate import simulate_time_varying as simulate_time_varying
+from lpvid.models._state_space import Modes as Modes
 from lpvid.models._state_space import StateSpace as StateSpace
+from lpvid.models._structures import AbstractStructure as AbstractStructure
+from lpvid.models._structures import FreeStructure as FreeStructure
+from lpvid.models._structures import FunctionStructure as FunctionStructure

@@ -1,18 +1,18 @@
-"""Frequency responses."""
+"""Frequency responses of models."""
 
-import jax.numpy as jnp
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, ArrayLike, Complex
+
+from lpvid.models._state_space import StateSpace
 
 
-def transfer(
-    A: Float[Array, "*#batch nx nx"],
-    B: Float[Array, "*#batch nx nu"],
-    C: Float[Array, "*#batch ny nx"],
-    D: Float[Array, "*#batch ny nu"],
-    points: Complex[Array, "*#batch frequency"],
+def frequency_response(
+    system: StateSpace, omega: ArrayLike
 ) -> Complex[Array, "*batch frequency ny nu"]:
-    """C (s I − A)⁻¹ B + D at given points s (or z) of the complex plane."""
-    shifted = points[..., None, None] * jnp.eye(A.shape[-1]) - A[..., None, :, :]
-    right = jnp.broadcast_to(B[..., None, :, :], (*shifted.shape[:-1], B.shape[-1]))
-    solved = jnp.linalg.solve(shifted, right.astype(shifted.dtype))
-    return C[..., None, :, :].astype(shifted.dtype) @ solved + D[..., None, :, :]
+    """Transfer matrix at angular frequencies; see `StateSpace.frequency_response`.
+
+    Example:
+        >>> from lpvid.models import StateSpace, frequency_response
+        >>> abs(frequency_response(StateSpace([[-1.0]], [[1.0]], [[1.0]]), 1.0)).round(3).item()
+        0.707
+    """
+    return system.frequency_response(omega)

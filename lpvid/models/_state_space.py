@@ -3,14 +3,12 @@
 import math
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
-from lpvid.models._convert import AbstractConversion, ZeroOrderHold
-from lpvid.models._frequency import transfer
-from lpvid.models._simulate import simulate_lti
+from lpvid.models._hold import AbstractConversion, ZeroOrderHold
+from lpvid.models._lifted import simulate_lti
+from lpvid.models._transfer import transfer
 
 
 class Modes(eqx.Module):
@@ -212,9 +210,7 @@ class StateSpace(eqx.Module):
             raise ValueError("The model is in continuous time: give the sample time dt of u.")
         return self.discretise(dt)
 
-    def frequency_response(
-        self, omega: ArrayLike
-    ) -> Complex[Array, "*batch frequency ny nu"]:
+    def frequency_response(self, omega: ArrayLike) -> Complex[Array, "*batch frequency ny nu"]:
         """Transfer matrix at the angular frequencies `omega` (rad/s)."""
         omega = jnp.atleast_1d(jnp.asarray(omega, float))
         points = jnp.exp(1j * omega * self.dt) if self.is_discrete else 1j * omega
@@ -267,7 +263,7 @@ class StateSpace(eqx.Module):
         T = _matrix("T", T)
         if T.shape[-2:] != (self.nx, self.nx):
             raise ValueError(f"T has shape {T.shape}; ({self.nx}, {self.nx}) is needed.")
-        right = jnp.concatenate([(T @ self.A).mT, jnp.broadcast_to(self.C, self.C.shape).mT], -1)
+        right = _join((T @ self.A).mT, self.C.mT, axis=-1)
         solved = jnp.linalg.solve(T.mT, right).mT
         return StateSpace(
             solved[..., : self.nx, :], T @ self.B, solved[..., self.nx :, :], self.D, dt=self.dt
@@ -314,18 +310,13 @@ class StateSpace(eqx.Module):
                 f"Cannot connect: the first model has {other.ny} outputs, the second "
                 f"{self.nu} inputs."
             )
+        # States of `other` first; its output drives the states of this model.
         coupling = self.B @ other.C
-        upper = jnp.zeros((*coupling.shape[:-2], other.nx, self.nx))
-        A = _block_diagonal(other.A, self.A)
-        corner = jnp.concatenate(
-            [
-                jnp.zeros((*coupling.shape[:-2], other.nx, other.nx + self.nx)),
-                jnp.concatenate([coupling, upper.mT @ upper], axis=-1),
-            ],
-            axis=-2,
-        )
+        above = jnp.zeros((*coupling.shape[:-2], other.nx, other.nx + self.nx))
+        beside = jnp.zeros((*coupling.shape[:-2], self.nx, self.nx))
+        corner = _join(above, _join(coupling, beside, axis=-1), axis=-2)
         return StateSpace(
-            A + corner,
+            _block_diagonal(other.A, self.A) + corner,
             _join(other.B, self.B @ other.D, axis=-2),
             _join(self.D @ other.C, self.C, axis=-1),
             self.D @ other.D,

@@ -1,0 +1,186 @@
+"""Matrix functions and equations that JAX lacks: Lyapunov, square root, logarithm.
+
+Each takes matrices with any leading batch axes and returns matrices.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+_DOUBLINGS = 60
+_SQUARE_ROOTS = 4
+_ROOT_ITERATIONS = 18
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+
+
+def _doubling(left: Array, right: Array, constant: Array) -> Array:
+    """Σ_k leftᵏ Q rightᵏ by Smith's doubling; NaN where the sum does not converge."""
+
+    def unfinished(carry):
+        left, right, _, count = carry
+        size = jnp.linalg.norm(left) * jnp.linalg.norm(right)
+        # The remainder relative to the sum is below this product.
+        return (count < _DOUBLINGS) & (size > 1e-18) & jnp.isfinite(size)
+
+    def double(carry):
+        left, right, total, count = carry
+        return left @ left, right @ right, total + left @ total @ right, count + 1
+
+    left, right, total, _ = lax.while_loop(unfinished, double, (left, right, constant, 0))
+    size = jnp.linalg.norm(left) * jnp.linalg.norm(right)
+    return jnp.where(size <= 1e-18, total, jnp.nan)
+
+
+def _stein(left: Array, right: Array, constant: Array) -> Array:
+    return lax.custom_linear_solve(
+        lambda X: X - left @ X @ right,
+        constant,
+        solve=lambda _, Q: _doubling(left, right, Q),
+        transpose_solve=lambda _, Q: _doubling(left.T, right.T, Q),
+    )
+
+
+@jax.jit
+def stein(
+    left: Float[Array, "*#batch n n"],
+    right: Float[Array, "*#batch m m"],
+    constant: Float[Array, "*#batch n m"],
+) -> Float[Array, "*batch n m"]:
+    """Solve X = F X G + Q by doubling (Smith 1968), with implicit derivatives of any order.
+
+    Args:
+        left: F; the product of the spectral radii of F and G must be below one, else NaN.
+        right: G.
+        constant: Q.
+    """
+    return jnp.vectorize(_stein, signature="(n,n),(m,m),(n,m)->(n,m)")(left, right, constant)
+
+
+def discrete_lyapunov(
+    A: Float[Array, "*#batch n n"], Q: Float[Array, "*#batch n n"]
+) -> Float[Array, "*batch n n"]:
+    """Solve X = A X Aᵀ + Q; NaN where A is not Schur stable.
+
+    Args:
+        A: square matrix.
+        Q: constant term, symmetric or not.
+    """
+    return stein(A, A.mT, Q)
+
+
+def _cayley(left: Array, right: Array, constant: Array) -> Array:
+    n, m = left.shape[-1], right.shape[-1]
+    # The geometric mean of the eigenvalues' sizes centres them on the unit disc; the solution
+    # does not depend on it, so no derivative passes.
+    _, log_determinant = jnp.linalg.slogdet(lax.stop_gradient(left))
+    shift = jnp.exp(log_determinant / n)
+    inverse_left = jnp.linalg.inv(shift * jnp.eye(n) - left)
+    inverse_right = jnp.linalg.inv(shift * jnp.eye(m) - right)
+    discrete_left = 2.0 * shift * inverse_left - jnp.eye(n)
+    discrete_right = 2.0 * shift * inverse_right - jnp.eye(m)
+
+    def solve(constant):
+        transformed = 2.0 * shift * inverse_left @ constant @ inverse_right
+        return _stein(discrete_left, discrete_right, transformed)
+
+    solution = solve(constant)
+    return solution + solve(left @ solution + solution @ right + constant)
+
+
+@jax.jit
+def continuous_sylvester(
+    left: Float[Array, "*#batch n n"],
+    right: Float[Array, "*#batch m m"],
+    constant: Float[Array, "*#batch n m"],
+) -> Float[Array, "*batch n m"]:
+    """Solve F X + X G + Q = 0 for stable F and G, by a Cayley transform and doubling.
+
+    With F_d = (α + F)(α − F)⁻¹, G_d likewise, X = F_d X G_d + 2 α (α − F)⁻¹ Q (α − G)⁻¹. One step
+    of refinement on the residual recovers what the transform of a stiff problem loses.
+
+    Args:
+        left: F; NaN where F or G is not stable.
+        right: G.
+        constant: Q.
+    """
+    return jnp.vectorize(_cayley, signature="(n,n),(m,m),(n,m)->(n,m)")(left, right, constant)
+
+
+def continuous_lyapunov(
+    A: Float[Array, "*#batch n n"], Q: Float[Array, "*#batch n n"]
+) -> Float[Array, "*batch n n"]:
+    """Solve A X + X Aᵀ + Q = 0; NaN where A is not Hurwitz stable.
+
+    Args:
+        A: square matrix.
+        Q: constant term, symmetric or not.
+    """
+    return continuous_sylvester(A, A.mT, Q)
+
+
+def _sqrtm(matrix: Array) -> Array:
+    n = matrix.shape[0]
+    identity = jnp.eye(n)
+
+    def iterate(carry, _):
+        product, root = carry
+        _, log_determinant = jnp.linalg.slogdet(lax.stop_gradient(product))
+        scale = jnp.exp(-log_determinant / (2.0 * n))
+        inverse = jnp.linalg.inv(product) / scale**2
+        root = 0.5 * scale * (root + root @ inverse)
+        product = 0.5 * (identity + 0.5 * (scale**2 * product + inverse))
+        return (product, root), None
+
+    (product, root), _ = lax.scan(iterate, (matrix, matrix), None, length=_ROOT_ITERATIONS)
+    return jnp.where(jnp.max(jnp.abs(product - identity)) < 1e-6, root, jnp.nan)
+
+
+@jax.jit
+def sqrtm(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+    """Principal square root by the product Denman–Beavers iteration (Higham 2008, eq. 6.29).
+
+    The number of iterations is fixed, so that it differentiates and batches. NaN where an
+    eigenvalue lies on the closed negative real axis (or so near that the iteration has not met
+    its end).
+
+    Args:
+        matrix: square matrix.
+    """
+    return jnp.vectorize(_sqrtm, signature="(n,n)->(n,n)")(matrix)
+
+
+def _logm(matrix: Array) -> Array:
+    identity = jnp.eye(matrix.shape[0])
+
+    def halve(carry, _):
+        chosen, factor = carry
+        far = jnp.linalg.norm(chosen - identity) > 0.5
+        # Where the matrix is near already, the root of the identity keeps derivatives finite.
+        root = _sqrtm(jnp.where(far, chosen, identity))
+        return (jnp.where(far, root, chosen), jnp.where(far, 2.0 * factor, factor)), None
+
+    start = (matrix, jnp.asarray(1.0))
+    (chosen, factor), _ = lax.scan(halve, start, None, length=_SQUARE_ROOTS)
+    excess = chosen - identity
+    nodes = jnp.asarray(0.5 * (_NODES + 1.0))[:, None, None]
+    weights = jnp.asarray(0.5 * _WEIGHTS)[:, None, None]
+    right = jnp.broadcast_to(excess[None], (_NODES.size, *excess.shape))
+    terms = jnp.linalg.solve(identity[None] + nodes * excess[None], right)
+    return factor * jnp.sum(weights * terms, axis=0)
+
+
+@jax.jit
+def logm(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+    """Principal logarithm by inverse scaling and squaring (Higham 2008, algorithm 11.9).
+
+    log A = 2ᵏ log A^(1/2ᵏ), and log(I + E) = ∫₀¹ E (I + t E)⁻¹ dt by 16 Gauss–Legendre nodes,
+    which is the diagonal Padé approximant of degree 16. Of the roots k = 0 … 4 the first near
+    enough to the identity is taken: each further root loses a bit to cancellation. Fixed counts:
+    it differentiates and batches. NaN where an eigenvalue lies on the closed negative real axis.
+
+    Args:
+        matrix: square matrix.
+    """
+    return jnp.vectorize(_logm, signature="(n,n)->(n,n)")(matrix)

@@ -1,0 +1,18 @@
+"""Plots: results in, Matplotlib axes out. Nothing is shown and no global setting is changed.
+
+Every function takes `axes=` (draw there; new ones are made otherwise) and returns the axes it
+drew on. Matplotlib is imported when the first plot is drawn, not with lpvid.
+"""
+
+from lpvid.plot._figure import save_figure as save_figure
+from lpvid.plot._frequency import bode as bode
+from lpvid.plot._frequency import singular_values as singular_values
+from lpvid.plot._parameters import parameters as parameters
+from lpvid.plot._poles import mode_frequencies as mode_frequencies
+from lpvid.plot._poles import poles as poles
+from lpvid.plot._residuals import residuals as residuals
+from lpvid.plot._search import fit_over_points as fit_over_points
+from lpvid.plot._search import minima as minima
+from lpvid.plot._search import scree as scree
+from lpvid.plot._time import compare as compare
+from lpvid.plot._time import records as records

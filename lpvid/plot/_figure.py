@@ -1,0 +1,201 @@
+"""What all plots share: palette, fresh or given axes, labels, labelled sets of systems, saving."""
+
+import functools
+import io
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeAlias, TypeVar
+
+import numpy as np
+
+from lpvid._files import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:
+    # Matplotlib is not imported for an annotation.
+    Axes: TypeAlias = Any
+    Figure: TypeAlias = Any
+
+# Okabe and Ito's colours, told apart with any colour vision, those strong on white first.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000")
+DATA_COLOUR = "#333333"
+REFERENCE_COLOUR = "#000000"
+FAINT = "#8C8C8C"
+# A second sign beside the colour, for print in grey.
+DASHES = ("-", (0, (6, 2)), (0, (2, 1.2)), (0, (6, 2, 1.5, 2)), (0, (9, 2, 2, 2, 2, 2)))
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+_STYLE = {
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.titleweight": "bold",
+    "axes.labelsize": 9.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "axes.unicode_minus": True,
+}
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+
+def styled(draw: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Draw in lpvid's style; Matplotlib's own settings are back afterwards."""
+
+    @functools.wraps(draw)
+    def wrapped(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        import matplotlib
+
+        with matplotlib.rc_context(_STYLE):
+            return draw(*args, **kwargs)
+
+    return wrapped
+
+
+def grid_of_axes(
+    rows: int,
+    columns: int,
+    axes: Any,
+    *,
+    size: tuple[float, float],
+    sharex: bool | str = False,
+    height_ratios: Sequence[float] | None = None,
+) -> np.ndarray:
+    """`rows` × `columns` axes: those given if they are as many, else of a new figure."""
+    if axes is None:
+        import matplotlib.pyplot as plt
+
+        _, made = plt.subplots(
+            rows,
+            columns,
+            figsize=size,
+            sharex=sharex,  # pyright: ignore[reportArgumentType]
+            squeeze=False,
+            layout="constrained",
+            height_ratios=height_ratios,
+        )
+        return made
+    given = np.atleast_1d(np.asarray(axes, dtype=object))
+    if given.size != rows * columns:
+        raise ValueError(
+            f"axes: {rows} x {columns} are needed here, {given.size} given; leave axes out, or "
+            f"make them with plt.subplots({rows}, {columns})."
+        )
+    return given.reshape(rows, columns)
+
+
+def dress(axes: Axes) -> None:
+    """Light grid behind the data, no box."""
+    axes.grid(True, which="major", color="#D9D9D9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=_STYLE["xtick.labelsize"])
+
+
+def legend(axes: Axes, **options: Any) -> None:
+    """Legend where something is labelled, on a translucent ground."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(framealpha=0.85, edgecolor="none", **options)
+
+
+def with_unit(name: str, unit: str) -> str:
+    """`name (unit)`, or the name alone."""
+    return f"{name} ({unit})" if unit else name
+
+
+def labelled(
+    items: Any, labels: Sequence[str] | str | None, argument: str, noun: str
+) -> dict[str, Any]:
+    """One item, a sequence or a mapping as label → item."""
+    if isinstance(items, Mapping):
+        if labels is not None:
+            raise ValueError(f"labels: {argument} has its own; give one of the two.")
+        found = {str(label): item for label, item in items.items()}
+    else:
+        several = list(items) if isinstance(items, list | tuple) else [items]
+        if labels is None:
+            labels = (
+                [noun] if len(several) == 1 else [f"{noun} {i + 1}" for i in range(len(several))]
+            )
+        labels = [labels] if isinstance(labels, str) else list(labels)
+        if len(labels) != len(several):
+            raise ValueError(f"labels: {len(labels)} given for {len(several)} {argument}.")
+        if len(set(labels)) != len(labels):
+            raise ValueError(f"labels: {labels} holds a label twice; give distinct ones.")
+        found = dict(zip(labels, several, strict=True))
+    if not found:
+        raise ValueError(f"{argument}: none given.")
+    return found
+
+
+def model_of(item: Any) -> Any:
+    """The model of a result such as a `Fit` or a `Restructured`; a model itself."""
+    return getattr(item, "model", item)
+
+
+def channel_names(names: Sequence[str] | None, count: int, prefix: str, argument: str) -> list[str]:
+    """Names given, or y1, y2, …"""
+    if names is None:
+        return [f"{prefix}{i + 1}" for i in range(count)]
+    if len(names) != count:
+        raise ValueError(f"{argument}: {len(names)} given for {count} channels.")
+    return list(names)
+
+
+def colour(index: int) -> str:
+    """Colour of the index-th thing; they recur after seven."""
+    return COLOURS[index % len(COLOURS)]
+
+
+def dashes(index: int) -> Any:
+    """Line style of the index-th thing."""
+    return DASHES[index % len(DASHES)]
+
+
+def figure_of(axes: Any) -> Figure:
+    """The figure that axes (or an array of them, or the figure itself) belong to."""
+    if hasattr(axes, "savefig"):
+        return axes
+    first = np.atleast_1d(np.asarray(axes, dtype=object)).ravel()
+    if first.size == 0 or not hasattr(first[0], "get_figure"):
+        raise ValueError(
+            f"axes: Matplotlib axes, an array of them or a figure is needed, got "
+            f"{type(axes).__name__}."
+        )
+    return first[0].get_figure(root=True)
+
+
+def png_bytes(axes: Any, *, dpi: float = 150.0, close: bool = True, form: str = "png") -> bytes:
+    """The figure of `axes` as the content of an image file; the figure is closed after."""
+    figure = figure_of(axes)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=form, dpi=dpi, facecolor="white")
+    if close:
+        import matplotlib.pyplot as plt
+
+        plt.close(figure)
+    return buffer.getvalue()
+
+
+def save_figure(axes: Any, path: str | os.PathLike[str], *, dpi: float = 150.0) -> Path:
+    """Write the figure of `axes` to a file and close it; an interruption leaves the old file.
+
+    `axes` may be axes, an array of them or the figure; the suffix of `path` gives the form (PNG
+    where there is none). Returns the path.
+
+    Raises `ValueError` for a form that Matplotlib cannot write, `OSError` where the folder cannot
+    be written.
+
+    **Example**
+
+        save_figure(bode(fit.model), "bode.png")
+    """
+    form = Path(path).suffix.lstrip(".").lower() or "png"
+    supported = figure_of(axes).canvas.get_supported_filetypes()
+    if form not in supported:
+        raise ValueError(f"path: no {form!r} files are written; use one of {', '.join(supported)}.")
+    return write_atomically(path, png_bytes(axes, dpi=dpi, form=form))

@@ -1,0 +1,241 @@
+"""Frequency responses: Bode magnitude and phase, singular values."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike
+
+from lpvid.models import StateSpace
+from lpvid.plot._figure import (
+    Axes,
+    channel_names,
+    colour,
+    dashes,
+    dress,
+    grid_of_axes,
+    labelled,
+    legend,
+    model_of,
+    styled,
+)
+
+_HZ = 2.0 * np.pi
+
+
+@styled
+def bode(
+    systems: Any,
+    omega: ArrayLike | None = None,
+    labels: Sequence[str] | str | None = None,
+    *,
+    phase: bool = False,
+    decibels: bool = True,
+    input_names: Sequence[str] | None = None,
+    output_names: Sequence[str] | None = None,
+    axes: Any = None,
+) -> np.ndarray:
+    """Magnitude of every entry of the transfer matrix: outputs down, inputs across.
+
+    **Arguments**
+
+    - `systems`: a `StateSpace`, a result that holds one, or several in a sequence or a mapping
+      label → system. A batch of models is drawn in one colour.
+    - `omega`: frequencies in rad/s; by default a decade around the poles. A discrete-time model
+      is drawn up to its Nyquist frequency.
+    - `labels`: one for each system of a sequence.
+    - `phase`: add a row with the phase, unwrapped, in degrees, below each output.
+    - `decibels`: magnitude in dB, or on a logarithmic axis.
+
+    Returns the axes, shape (ny, nu), or (2 ny, nu) with phase.
+
+    Raises `ValueError` for systems with different numbers of inputs or outputs.
+
+    **Example**
+
+        bode([fit.model, truth], labels=["identified", "truth"])
+    """
+    models = _models(systems, labels)
+    ny, nu = _common_size(models)
+    inputs = channel_names(input_names, nu, "u", "input_names")
+    outputs = channel_names(output_names, ny, "y", "output_names")
+    rows = 2 if phase else 1
+    panels = grid_of_axes(
+        rows * ny,
+        nu,
+        axes,
+        size=(max(5.5, 0.8 + 3.2 * nu), 0.8 + (3.6 if phase else 2.4) * ny),
+        sharex=True,
+        height_ratios=[1.6, 1.0] * ny if phase else None,
+    )
+    for panel in panels.ravel():
+        dress(panel)
+    for index, (label, model) in enumerate(models.items()):
+        grid = _grid(omega, model, models)
+        response = _response(model, grid)
+        look = _look(index, response.shape[0])
+        for (k, j), panel in np.ndenumerate(panels[::rows]):
+            for member, one in enumerate(response[:, :, k, j]):
+                name = label if member == 0 else "_"
+                panel.plot(grid / _HZ, _magnitude(one, decibels), label=name, **look)
+                if phase:
+                    panels[rows * k + 1, j].plot(grid / _HZ, _phase(one), **look)
+    for (k, j), panel in np.ndenumerate(panels):
+        panel.set_xscale("log")
+        is_phase = phase and k % 2 == 1
+        if not is_phase and not decibels:
+            panel.set_yscale("log")
+        if j == 0:
+            quantity = "phase (deg)" if is_phase else _magnitude_label(decibels)
+            panel.set_ylabel(quantity)
+        if not is_phase:
+            panel.set_title(f"{outputs[k // rows]} from {inputs[j]}", loc="left")
+        if k == rows * ny - 1:
+            panel.set_xlabel("frequency (Hz)")
+    if len(models) > 1 or labels is not None:
+        legend(panels[0, 0])
+    return panels
+
+
+@styled
+def singular_values(
+    systems: Any,
+    omega: ArrayLike | None = None,
+    labels: Sequence[str] | str | None = None,
+    *,
+    decibels: bool = True,
+    axes: Axes | None = None,
+) -> Axes:
+    """Singular values of the transfer matrix over frequency; the peak of the largest is H∞.
+
+    The arguments are those of `bode`. Systems may have different numbers of inputs and outputs.
+
+    **Example**
+
+        singular_values({"error": best.model - fit_continuous})
+    """
+    models = _models(systems, labels)
+    panel = grid_of_axes(1, 1, axes, size=(6.0, 3.6))[0, 0]
+    dress(panel)
+    for index, (label, model) in enumerate(models.items()):
+        grid = _grid(omega, model, models)
+        response = _response(model, grid)
+        look = _look(index, response.shape[0])
+        values = np.linalg.svd(response, compute_uv=False)
+        for member in range(values.shape[0]):
+            for order in range(values.shape[-1]):
+                name = label if member == order == 0 else "_"
+                curve = _magnitude(values[member, :, order], decibels)
+                panel.plot(grid / _HZ, curve, label=name, **look)
+    panel.set_xscale("log")
+    if not decibels:
+        panel.set_yscale("log")
+    panel.set_xlabel("frequency (Hz)")
+    panel.set_ylabel(_magnitude_label(decibels).replace("magnitude", "singular values"))
+    if len(models) > 1 or labels is not None:
+        legend(panel)
+    return panel
+
+
+def _models(systems: Any, labels: Sequence[str] | str | None) -> dict[str, StateSpace]:
+    models = {}
+    for label, item in labelled(systems, labels, "systems", "system").items():
+        model = model_of(item)
+        if not isinstance(model, StateSpace):
+            raise ValueError(
+                f"systems: {label!r} is a {type(item).__name__}; give state-space models (of an "
+                "LPV model lpv.at(kappa))."
+            )
+        models[label] = model
+    return models
+
+
+def _common_size(models: dict[str, StateSpace]) -> tuple[int, int]:
+    sizes = {label: (model.ny, model.nu) for label, model in models.items()}
+    if len(set(sizes.values())) > 1:
+        listed = ", ".join(f"{label!r} {ny} x {nu}" for label, (ny, nu) in sizes.items())
+        raise ValueError(
+            f"systems: outputs x inputs differ ({listed}); plot them apart, or use singular_values."
+        )
+    return next(iter(sizes.values()))
+
+
+def _look(index: int, members: int) -> dict[str, Any]:
+    # A cloud of models is drawn thin and translucent, so that its density shows.
+    several = members > 1
+    return {
+        "color": colour(index),
+        "linestyle": "-" if several else dashes(index),
+        "linewidth": 0.7 if several else 1.4,
+        "alpha": max(0.12, min(0.6, 6.0 / members)) if several else 1.0,
+    }
+
+
+def _response(model: StateSpace, omega: np.ndarray) -> np.ndarray:
+    """Response with all batch axes as one in front: (member, frequency, ny, nu)."""
+    response = np.asarray(model.frequency_response(omega))
+    return response.reshape(-1, *response.shape[-3:])
+
+
+def _grid(omega: ArrayLike | None, model: StateSpace, models: dict[str, StateSpace]) -> np.ndarray:
+    """Frequencies to draw `model` at, in rad/s, up to its Nyquist frequency."""
+    nyquist = np.pi / model.dt if model.is_discrete else np.inf
+    if omega is not None:
+        given = np.atleast_1d(np.asarray(omega, float))
+        if given.ndim != 1 or not np.all(given >= 0):
+            raise ValueError("omega: a one-dimensional array of frequencies from 0 is needed.")
+        return given[given <= nyquist * (1 + 1e-9)]
+    low, high = _range(models)
+    grid = np.geomspace(low, high, 400)
+    poles = _continuous_poles(model)
+    # A sharp peak between two points of a plain grid would be cut off.
+    upper = poles[poles.imag > 0]
+    around = np.linspace(-4.0, 4.0, 17)
+    close = (upper.imag[:, None] + np.abs(upper.real)[:, None] * around[None]).ravel()
+    if close.size > 2000:
+        close = close[:: close.size // 2000 + 1]
+    grid = np.union1d(grid, close[(close > low) & (close < high)])
+    if nyquist <= high:
+        return np.append(grid[grid < nyquist], nyquist)
+    return grid
+
+
+def _range(models: dict[str, StateSpace]) -> tuple[float, float]:
+    """From a decade below the slowest pole to a decade above the fastest, in rad/s."""
+    lows, highs = [], []
+    for model in models.values():
+        sizes = np.abs(_continuous_poles(model))
+        nyquist = np.pi / model.dt if model.is_discrete else np.inf
+        # Integrators and deadbeat poles say nothing about the frequencies of interest.
+        sizes = sizes[np.isfinite(sizes) & (sizes > 1e-9 * np.max(sizes, initial=0.0))]
+        if sizes.size:
+            lows.append(np.min(sizes) / 10.0)
+            highs.append(min(np.max(sizes) * 10.0, nyquist))
+        elif np.isfinite(nyquist):
+            lows.append(1e-3 * nyquist)
+            highs.append(nyquist)
+    low, high = (min(lows), max(highs)) if lows else (0.1, 10.0)
+    return float(min(low, 0.1 * high)), float(high)
+
+
+def _continuous_poles(model: StateSpace) -> np.ndarray:
+    poles = np.asarray(model.poles()).ravel()
+    if model.is_discrete:
+        poles = np.log(poles[poles != 0].astype(complex)) / model.dt
+    return poles
+
+
+def _magnitude(response: np.ndarray, decibels: bool) -> np.ndarray:
+    size = np.abs(response)
+    size = np.where(size > 0, size, np.nan)
+    return 20.0 * np.log10(size) if decibels else size
+
+
+def _magnitude_label(decibels: bool) -> str:
+    return "magnitude (dB)" if decibels else "magnitude"
+
+
+def _phase(response: np.ndarray) -> np.ndarray:
+    if not np.any(response):
+        return np.full(response.shape, np.nan)
+    return np.rad2deg(np.unwrap(np.angle(response)))

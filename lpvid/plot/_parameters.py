@@ -1,0 +1,171 @@
+"""Parameters over the scheduling: local values, the LPV model's curve, a reference."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike
+
+from lpvid.models import LPVStateSpace
+from lpvid.plot._figure import REFERENCE_COLOUR, colour, dress, grid_of_axes, styled
+
+
+@styled
+def parameters(
+    lpv: LPVStateSpace,
+    kappas: ArrayLike | None = None,
+    parameters: Any = None,
+    reference: Callable[[Any], ArrayLike] | ArrayLike | None = None,
+    names: Sequence[str] | None = None,
+    *,
+    which: Sequence[int] | None = None,
+    along: int = 0,
+    at: ArrayLike | None = None,
+    name: str | None = None,
+    axes: Any = None,
+) -> np.ndarray:
+    """Every parameter of an LPV model over κ, in small multiples.
+
+    **Arguments**
+
+    - `kappas`, `parameters`: local models, drawn as dots: where they are, shape (n_points,) or
+      (n_points, n_scheduling), and their parameters, shape (n_points, n_parameters), or the
+      results of `restructure`.
+    - `reference`: drawn dashed: a function κ → ϑ, or values at `kappas`.
+    - `names`: of all parameters; those of the structure by default.
+    - `which`: indices of the parameters to draw; all by default.
+    - `along`, `at`: with several scheduling variables, the one that is drawn and the point that
+      holds the others' values (the middle by default). Local models elsewhere are drawn hollow.
+    - `name`: of the scheduling variable, "κ" by default.
+
+    Returns the axes, one for each parameter drawn.
+
+    **Example**
+
+        parameters(lpv, kappas, local, reference=exact_parameters)
+    """
+    count = lpv.structure.n_parameters
+    names = list(lpv.structure.parameter_names if names is None else names)
+    if len(names) != count:
+        raise ValueError(f"names: {len(names)} given for {count} parameters.")
+    chosen = list(range(count)) if which is None else [int(index) for index in which]
+    points = _points(kappas, lpv.n_scheduling)
+    local = _local(parameters, points, count)
+    low, high = np.asarray(lpv.kappa_low), np.asarray(lpv.kappa_high)
+    middle = (low + high) / 2.0 if at is None else np.atleast_1d(np.asarray(at, float))
+    grid = np.tile(middle, (101, 1))
+    grid[:, along] = np.linspace(low[along], high[along], 101)
+    curves = np.asarray(lpv.parameters(grid))
+    exact = _reference(reference, grid, points, along, count)
+    panels = _panels(len(chosen), axes)
+    for panel, index in zip(panels, chosen, strict=True):
+        dress(panel)
+        panel.plot(
+            grid[:, along], curves[:, index], color=colour(0), linewidth=1.4, label="LPV model"
+        )
+        if exact is not None:
+            panel.plot(
+                exact[0],
+                exact[1][:, index],
+                color=REFERENCE_COLOUR,
+                linewidth=1.0,
+                linestyle="--",
+                label="reference",
+            )
+        if local is not None and points is not None:
+            _draw_local(panel, points, local[:, index], middle, along, high - low)
+        panel.set_title(names[index], loc="left")
+    label = name or ("κ" if lpv.n_scheduling == 1 else f"κ{along + 1}")
+    columns = _columns(len(chosen))
+    for panel in panels[-columns:]:
+        panel.set_xlabel(label)
+        panel.tick_params(labelbottom=True)
+    handles, texts = panels[0].get_legend_handles_labels()
+    if axes is None and len(handles) > 1:
+        panels[0].figure.legend(
+            handles, texts, loc="outside upper right", ncols=len(handles), frameon=False
+        )
+    return panels
+
+
+def _draw_local(panel, points, values, middle, along, width) -> None:
+    others = np.delete(np.arange(points.shape[1]), along)
+    distance = np.abs(points[:, others] - middle[others]) / np.where(width > 0, width, 1.0)[others]
+    on_line = np.all(distance < 1e-6, axis=1)
+    look = {"linestyle": "none", "marker": "o", "markersize": 4.5, "color": colour(1), "zorder": 3}
+    if np.any(on_line):
+        panel.plot(points[on_line, along], values[on_line], label="local models", **look)
+    if not np.all(on_line):
+        panel.plot(
+            points[~on_line, along],
+            values[~on_line],
+            markerfacecolor="none",
+            alpha=0.5,
+            label="local models elsewhere",
+            **look,
+        )
+
+
+def _columns(count: int) -> int:
+    return min(4, math.ceil(math.sqrt(count)))
+
+
+def _panels(count: int, axes: Any) -> np.ndarray:
+    if axes is not None:
+        return grid_of_axes(count, 1, axes, size=(0.0, 0.0))[:, 0]
+    columns = _columns(count)
+    rows = math.ceil(count / columns)
+    made = grid_of_axes(
+        rows, columns, None, size=(max(4.5, 2.6 * columns), 0.7 + 1.8 * rows), sharex=True
+    )
+    for panel in made.ravel()[count:]:
+        panel.remove()
+    return made.ravel()[:count]
+
+
+def _points(kappas: ArrayLike | None, n_scheduling: int) -> np.ndarray | None:
+    if kappas is None:
+        return None
+    points = np.asarray(kappas, float)
+    points = points[:, None] if points.ndim == 1 else points
+    if points.ndim != 2 or points.shape[1] != n_scheduling:
+        raise ValueError(
+            f"kappas: shape (n_points, {n_scheduling}) is needed, got {np.shape(kappas)}."
+        )
+    return points
+
+
+def _local(given: Any, points: np.ndarray | None, count: int) -> np.ndarray | None:
+    if given is None:
+        return None
+    if isinstance(given, list | tuple):
+        given = np.stack([np.asarray(getattr(item, "parameters", item)) for item in given])
+    values = np.asarray(given, float)
+    if points is None or values.shape != (points.shape[0], count):
+        needed = "kappas" if points is None else f"({points.shape[0]}, {count})"
+        raise ValueError(f"parameters: shape {values.shape} given, {needed} needed with it.")
+    return values
+
+
+def _reference(
+    reference: Any, grid: np.ndarray, points: np.ndarray | None, along: int, count: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """κ and values of the reference, in rising order of κ."""
+    if reference is None:
+        return None
+    if callable(reference):
+        arguments = grid[:, 0] if grid.shape[1] == 1 else grid
+        values = np.stack([np.asarray(reference(kappa), float).ravel() for kappa in arguments])
+        where = grid[:, along]
+    else:
+        values = np.asarray(reference, float)
+        if points is None or values.shape[0] != points.shape[0]:
+            raise ValueError(
+                "reference: values need kappas of the same length; or give a function."
+            )
+        where = points[:, along]
+    if values.ndim != 2 or values.shape[1] != count:
+        raise ValueError(f"reference: {count} parameters are needed, got shape {values.shape}.")
+    order = np.argsort(where)
+    return where[order], values[order]

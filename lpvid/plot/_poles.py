@@ -1,0 +1,251 @@
+"""Poles in the plane, and mode frequencies over the scheduling."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike
+
+from lpvid.models import LPVStateSpace, StateSpace
+from lpvid.plot._figure import (
+    FAINT,
+    MARKERS,
+    REFERENCE_COLOUR,
+    Axes,
+    colour,
+    dashes,
+    dress,
+    grid_of_axes,
+    labelled,
+    legend,
+    model_of,
+    styled,
+)
+
+_HZ = 2.0 * np.pi
+_DAMPINGS = (0.05, 0.1, 0.3, 0.7)
+
+
+@styled
+def poles(
+    systems: Any, labels: Sequence[str] | str | None = None, *, axes: Axes | None = None
+) -> Axes:
+    """Poles in the complex plane.
+
+    Continuous time: the s-plane divided by 2π, so that the distance from the origin is the
+    natural frequency in Hz, with lines of equal damping ratio and the unstable half shaded.
+    Discrete time: the z-plane with the unit circle.
+
+    `systems` and `labels` are those of `bode`; the poles of a batch of models make a cloud.
+
+    Raises `ValueError` for continuous- and discrete-time models together.
+
+    **Example**
+
+        poles({"identified": fit.model, "truth": truth})
+    """
+    models = {
+        label: model_of(item)
+        for label, item in labelled(systems, labels, "systems", "system").items()
+    }
+    discrete = {model.is_discrete for model in models.values()}
+    if len(discrete) > 1:
+        raise ValueError(
+            "systems: continuous- and discrete-time models do not share a plane; convert with "
+            "c2d or d2c."
+        )
+    panel = grid_of_axes(1, 1, axes, size=(5.2, 4.4))[0, 0]
+    dress(panel)
+    is_discrete = discrete.pop()
+    for index, (label, model) in enumerate(models.items()):
+        values = np.asarray(model.poles()).ravel()
+        values = values if is_discrete else values / _HZ
+        cloud = len(model.batch_shape) > 0
+        panel.plot(
+            values.real,
+            values.imag,
+            linestyle="none",
+            marker=MARKERS[index % len(MARKERS)],
+            markersize=3.0 if cloud else 6.5,
+            markerfacecolor=colour(index) if cloud else "none",
+            markeredgecolor=colour(index),
+            markeredgewidth=0.0 if cloud else 1.4,
+            alpha=0.4 if cloud else 1.0,
+            label=label,
+            zorder=3,
+        )
+    if is_discrete:
+        _unit_circle(panel)
+    else:
+        _damping_lines(panel)
+    if len(models) > 1 or labels is not None:
+        legend(panel)
+    return panel
+
+
+def _unit_circle(panel: Axes) -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 361)
+    panel.plot(np.cos(angle), np.sin(angle), color=FAINT, linewidth=1.0, label="_unit circle")
+    panel.axhline(0.0, color=FAINT, linewidth=0.8)
+    panel.axvline(0.0, color=FAINT, linewidth=0.8)
+    panel.set_aspect("equal", adjustable="datalim")
+    panel.set_xlabel("real part of z")
+    panel.set_ylabel("imaginary part of z")
+
+
+def _damping_lines(panel: Axes) -> None:
+    left, right = panel.get_xlim()
+    low, high = panel.get_ylim()
+    width = max(right - left, 1e-12)
+    # Both axes through the origin, and a strip of the unstable side, whatever the poles are.
+    left, right = min(left, -0.05 * width), max(right, 0.08 * width)
+    reach = max(abs(low), abs(high))
+    if reach <= 0.06:  # Matplotlib's limits about real poles alone
+        reach = 0.5 * (right - left)
+    low, high = -reach, reach
+    for damping in _DAMPINGS:
+        slope = np.sqrt(1.0 - damping**2) / damping
+        # The ray ends where it meets the left or the upper edge.
+        end = max(left, -high / slope)
+        for sign in (1.0, -1.0):
+            panel.plot(
+                [0.0, end],
+                [0.0, -sign * slope * end],
+                color=FAINT,
+                linewidth=0.7,
+                linestyle=(0, (4, 3)),
+                label=f"_damping {damping:g}",
+                zorder=1,
+            )
+        panel.annotate(
+            f"ζ = {damping:g}",
+            (end, -slope * end),
+            xytext=(2, 2),
+            textcoords="offset points",
+            color="#595959",
+            fontsize=7.5,
+            annotation_clip=False,
+        )
+    panel.axvspan(0.0, right, color="#D55E00", alpha=0.07, linewidth=0)
+    panel.axhline(0.0, color=FAINT, linewidth=0.8)
+    panel.axvline(0.0, color=FAINT, linewidth=0.8)
+    panel.set_xlim(left, right)
+    panel.set_ylim(low, high)
+    panel.set_xlabel("real part / 2π (Hz)")
+    panel.set_ylabel("imaginary part / 2π (Hz)")
+
+
+@styled
+def mode_frequencies(
+    systems: Any,
+    kappas: ArrayLike | None = None,
+    labels: Sequence[str] | str | None = None,
+    *,
+    damping: bool = False,
+    along: int = 0,
+    name: str | None = None,
+    axes: Any = None,
+) -> np.ndarray:
+    """Natural frequencies of the oscillatory modes over the scheduling κ.
+
+    **Arguments**
+
+    - `systems`: one, or a mapping label → one, of: an `LPVStateSpace` (a line over its range);
+      a list of local models or results at `kappas` (dots); a function κ → `StateSpace` (a dashed
+      black line, for an analytic reference).
+    - `kappas`: where the local models are, shape (n_points,) or (n_points, n_scheduling); also
+      the range of a function.
+    - `labels`: one for each system of a sequence of systems.
+    - `damping`: add a panel with the damping ratios.
+    - `along`: which scheduling variable is drawn; the others stay in the middle of their range.
+    - `name`: of the scheduling variable, "κ" by default.
+
+    Returns the axes, shape (1,), or (2,) with damping.
+
+    Raises `ValueError` where `kappas` is missing or has another length than the local models.
+
+    **Example**
+
+        mode_frequencies({"local": local, "LPV": lpv, "physics": arm.frozen_model}, kappas)
+    """
+    points = None if kappas is None else np.asarray(kappas, float)
+    points = points[:, None] if points is not None and points.ndim == 1 else points
+    if isinstance(systems, list | tuple) and labels is None:
+        systems = {"local models": systems}  # a plain list of local models is one system
+    rows = 2 if damping else 1
+    panels = grid_of_axes(rows, 1, axes, size=(6.0, 1.0 + 2.4 * rows), sharex=True)[:, 0]
+    for panel in panels:
+        dress(panel)
+    found = labelled(systems, labels, "systems", "model")
+    for index, (label, system) in enumerate(found.items()):
+        where, models, look = _along_kappa(system, label, points, along, index)
+        frequency, ratio = _modes(models)
+        for panel, values in zip(panels, (frequency / _HZ, ratio), strict=False):
+            for rank, curve in enumerate(values.T):
+                panel.plot(where, curve, label=label if rank == 0 else "_", **look)
+    panels[0].set_ylabel("mode frequency (Hz)")
+    panels[0].set_ylim(bottom=min(0.0, panels[0].get_ylim()[0]))
+    if damping:
+        panels[1].set_ylabel("damping ratio")
+    panels[-1].set_xlabel(
+        name or ("κ" if points is None or points.shape[1] == 1 else f"κ{along + 1}")
+    )
+    if len(found) > 1 or labels is not None:
+        legend(panels[0])
+    return panels
+
+
+def _along_kappa(
+    system: Any, label: str, points: np.ndarray | None, along: int, index: int
+) -> tuple[np.ndarray, list[StateSpace], dict[str, Any]]:
+    """κ, the models there, and how they are drawn."""
+    if isinstance(system, LPVStateSpace):
+        low, high = np.asarray(system.kappa_low), np.asarray(system.kappa_high)
+        grid = _line(low, high, along)
+        look = {"color": colour(index), "linestyle": dashes(index), "linewidth": 1.4}
+        return grid[:, along], [system.at(kappa) for kappa in grid], look
+    if points is None:
+        raise ValueError(f"kappas: needed for {label!r}, to know where its models are.")
+    if callable(system) and not isinstance(system, list | tuple):
+        function: Callable[[Any], StateSpace] = system
+        grid = _line(points.min(axis=0), points.max(axis=0), along)
+        look = {"color": REFERENCE_COLOUR, "linestyle": "--", "linewidth": 1.0, "zorder": 1.5}
+        arguments = grid[:, 0] if grid.shape[1] == 1 else grid
+        return grid[:, along], [function(kappa) for kappa in arguments], look
+    models = [model_of(item) for item in system]
+    if len(models) != points.shape[0]:
+        raise ValueError(
+            f"kappas: {points.shape[0]} points given for the {len(models)} models of {label!r}."
+        )
+    look = {
+        "color": colour(index),
+        "linestyle": "none",
+        "marker": MARKERS[index % len(MARKERS)],
+        "markersize": 5.0,
+    }
+    return points[:, along], models, look
+
+
+def _line(low: np.ndarray, high: np.ndarray, along: int) -> np.ndarray:
+    """Points from low to high in one variable, the others in the middle."""
+    grid = np.tile((low + high) / 2.0, (101, 1))
+    grid[:, along] = np.linspace(low[along], high[along], 101)
+    return grid
+
+
+def _modes(models: list[StateSpace]) -> tuple[np.ndarray, np.ndarray]:
+    """Frequency (rad/s) and damping by rank, shape (models, modes), NaN where there are fewer."""
+    upper = []
+    for model in models:
+        values = np.asarray(model.poles())
+        if model.is_discrete:
+            values = np.log(values.astype(complex)) / model.dt
+        # Rounding gives a double real pole a tiny imaginary part.
+        values = values[values.imag > 1e-9 * np.abs(values)]
+        upper.append(values[np.argsort(np.abs(values))])
+    count = max((values.size for values in upper), default=0)
+    frequency, damping = np.full((2, len(models), count), np.nan)
+    for row, values in enumerate(upper):
+        frequency[row, : values.size] = np.abs(values)
+        damping[row, : values.size] = -values.real / np.abs(values)
+    return frequency, damping
