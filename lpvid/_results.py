@@ -29,8 +29,8 @@ class Status(eqx.Enumeration):
         "marginal mode or add damping."
     )
     l_infinity = (
-        "The system is unstable: this is the L-infinity norm, the peak of its frequency response, not "
-        "an input-output gain. Stabilise the system if a gain is wanted."
+        "The system is unstable: this is the L-infinity norm, the peak of its frequency response, "
+        "not an input-output gain. Stabilise the system if a gain is wanted."
     )
 
 

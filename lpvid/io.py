@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from lpvid._files import write_atomically
 from lpvid.mechanics import ArmScales, DissipativeTwoLinkArm, TwoLinkArmStructure
@@ -110,16 +111,16 @@ def load(path: str | os.PathLike[str]) -> Any:
             f"its version is {version}, and this lpvid reads up to {_VERSION}",
             "update lpvid, or save the model again with this one",
         )
-    if document.get("kind") not in _CLASSES:
+    kind = document.get("kind")
+    if not isinstance(kind, str) or kind not in _CLASSES:
         raise _error(
             path,
-            f"its kind {document.get('kind')!r} is unknown (known: {', '.join(_CLASSES)})",
+            f"its kind {kind!r} is unknown (known: {', '.join(_CLASSES)})",
             "update lpvid if a newer one wrote it; otherwise write the file again",
         )
-    entry = {"class": document["kind"], "fields": document.get("fields")}
     try:
-        return _decode(entry, document["kind"])
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        return _decode({"class": kind, "fields": document.get("fields")}, kind)
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise _error(path, f"its content does not fit: {error}", _AGAIN) from error
 
 
@@ -168,7 +169,7 @@ def _encode(value: Any, where: str) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else {"float": _name_nonfinite(value)}
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         raise ValueError(f"{where}: its values are traced by JAX; save outside jit, vmap and grad.")
     if isinstance(value, np.generic):
         return _encode(value.item(), where)
@@ -243,7 +244,7 @@ def _decode_array(entry: dict[str, Any], where: str) -> jax.Array:
         values = [_NONFINITE[v] if isinstance(v, str) else v for v in values]
     stored = np.dtype(np.float64) if dtype.kind == "c" else dtype
     flat = np.array(values, dtype=stored).view(dtype)
-    if math.prod(shape) != flat.size or min(shape, default=0) < 0:
+    if flat.ndim != 1 or math.prod(shape) != flat.size or min(shape, default=0) < 0:
         raise ValueError(f"{where} has {flat.size} values for the shape {shape}")
     return jnp.asarray(flat.reshape(shape))
 

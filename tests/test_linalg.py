@@ -1,13 +1,14 @@
 """Matrix equations and functions against SciPy."""
 
 import jax
-import jax.test_util
 import jax.numpy as jnp
+import jax.test_util
 import numpy as np
 import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from lpvid import _linalg
 
 
@@ -71,8 +72,40 @@ def test_lyapunov_derivatives(solve):
         A, B = jnp.asarray(A), jnp.asarray(B)
         return jnp.sum(solve(A, B @ B.mT) ** 2)
 
-    # check_grads compares with finite differences, the second order too.
-    jax.test_util.check_grads(value, (A, B), order=2, modes=("fwd", "rev"), rtol=1e-5)
+    jax.test_util.check_grads(jax.jit(value), (A, B), order=1, modes=("fwd", "rev"), rtol=1e-6)
+    gradient = jax.jit(jax.grad(value))
+    E, step = jnp.asarray(rng.normal(size=(3, 3))), 1e-5
+    curvature = jax.jvp(lambda A: gradient(A, B), (A,), (E,))[1]
+    expected = (gradient(A + step * E, B) - gradient(A - step * E, B)) / (2 * step)
+    np.testing.assert_allclose(curvature, expected, rtol=1e-6)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**31), size=st.floats(-8, 2), spread=st.floats(0, 2))
+def test_expm_agrees_with_scipy(seed, size, spread):
+    rng = np.random.default_rng(seed)
+    A = 10.0**size * (rng.normal(size=(3, 6, 6)) / 6 - np.eye(6))
+    scale = 10.0 ** rng.uniform(-spread, spread, (3, 6, 1))
+    expected = scipy.linalg.expm(A) * scale / scale.mT
+    ours = np.asarray(_linalg.expm(jnp.asarray(A * scale / scale.mT)))
+    # The error in the balanced basis, where SciPy's answer is the accurate one.
+    error = (ours - expected) / scale * scale.mT
+    bound = 1e-13 * (1 + 10.0**size) * np.linalg.norm(scipy.linalg.expm(A), axis=(-2, -1))
+    assert np.all(np.linalg.norm(error, axis=(-2, -1)) <= bound * 10 ** (2 * spread))
+
+
+def test_expm_derivative_and_limits():
+    rng = np.random.default_rng(6)
+    A, E = rng.normal(size=(2, 4, 4))
+    for scale in (0.1, 3.0):
+        _, expected = scipy.linalg.expm_frechet(scale * A, E)
+        _, tangent = jax.jvp(_linalg.expm, (jnp.asarray(scale * A),), (jnp.asarray(E),))
+        np.testing.assert_allclose(tangent, expected, atol=1e-12 * np.abs(expected).max())
+    _, pullback = jax.vjp(_linalg.expm, jnp.asarray(scale * A))
+    _, expected = scipy.linalg.expm_frechet(scale * A.T, E)
+    np.testing.assert_allclose(pullback(jnp.asarray(E))[0], expected, rtol=1e-10)
+    np.testing.assert_array_equal(_linalg.expm(jnp.zeros((2, 3, 3)))[1], np.eye(3))
+    assert np.all(np.isnan(_linalg.expm(jnp.asarray([[-1e9]]))))
 
 
 @pytest.mark.parametrize("function", ["logm", "sqrtm"])
@@ -90,7 +123,9 @@ def test_logarithm_and_root_undo_the_exponential(function, seed, n, size):
     condition = np.linalg.cond(exponential)
     if function == "logm":
         # The exponential itself was rounded: an absolute error of eps, more if ill-conditioned.
-        np.testing.assert_allclose(_linalg.logm(jnp.asarray(exponential)), X, atol=3e-15 * condition)
+        np.testing.assert_allclose(
+            _linalg.logm(jnp.asarray(exponential)), X, atol=3e-15 * condition
+        )
     else:
         root = np.asarray(_linalg.sqrtm(jnp.asarray(exponential)))
         expected = scipy.linalg.expm(X / 2)

@@ -6,11 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jax.core import Tracer
+from jaxtyping import Array, Float
 
 from lpvid._results import Status
-from lpvid._types import Scalar
-from lpvid.analysis._level_set import certify_by_hamiltonian, certify_by_modes, sweep_modal
+from lpvid.analysis._level_set import certify_by_hamiltonian, sweep_modal
 from lpvid.analysis._modal import (
     Modal,
     modal_form,
@@ -51,9 +51,9 @@ def hinf_norm(system: StateSpace, *, tolerance: float = 1e-10) -> HinfNorm:
     The derivative of the value is that of the largest singular value at the peak (envelope
     theorem), forward and reverse: one element of the subdifferential where peaks or singular values
     tie, zero where the norm is infinite. First derivatives only; `frequency` has none. Works under
-    `jit` and `vmap`. A batch costs least as leading axes of `system` or through `vmap`; a system for
-    which the cheap certificate (an eigenproblem of size n) does not hold is then treated on its own
-    by the Hamiltonian of size 2 n, which needs LAPACK (CPU) for the Schur form.
+    `jit` and `vmap`. A batch costs least as leading axes of `system` or through `vmap`; a system
+    for which the cheap certificate (an eigenproblem of size n) does not hold is then treated on its
+    own by the Hamiltonian of size 2 n, whose Schur form needs LAPACK and therefore a CPU.
 
     Args:
         system: continuous (`dt = 0`) or discrete model with nx >= 1 states, with or without D, with
@@ -81,7 +81,7 @@ def hinf_norm(system: StateSpace, *, tolerance: float = 1e-10) -> HinfNorm:
     matrices = (system.A, system.B, system.C, system.D)
     batch = system.A.shape[:-2]
     flat = tuple(m.reshape(-1, *m.shape[-2:]) for m in matrices)
-    solve = _norms if any(isinstance(m, jax.core.Tracer) for m in matrices) else _norms_jitted
+    solve = _norms if any(isinstance(m, Tracer) for m in matrices) else _norms_jitted
     value, omega, status = solve(flat, system.dt, tolerance)
     status = jax.tree.map(lambda code: code.reshape(batch), status)
     return HinfNorm(value.reshape(batch), omega.reshape(batch), status)
@@ -93,7 +93,7 @@ def check_system(system: StateSpace) -> None:
         raise ValueError("system has no states; its norm is the largest singular value of D.")
     for name in ("A", "B", "C", "D"):
         matrix = getattr(system, name)
-        if not isinstance(matrix, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(matrix))):
+        if not isinstance(matrix, Tracer) and not bool(jnp.all(jnp.isfinite(matrix))):
             raise ValueError(
                 f"system.{name} holds NaN or infinity; look for a failed fit or an overflow in the "
                 "parameters it was made from."
@@ -203,56 +203,73 @@ def largest_peak(form: Modal, continuous, usable, tolerance: float):
     # Climbing costs a few microseconds a candidate, a missed peak a whole eigenproblem: half of the
     # poles' frequencies, which is one per oscillating mode.
     _, best = lax.top_k(gains, min(max(3, A.shape[0] // 2), 8, omega.shape[0]))
-    climbed, reached = refine_peaks(form, omega[best], width[best], 6)
+    climbed, reached = refine_peaks(form, omega[best], width[best], 5)
     top = jnp.argmax(reached)
     gain, peak = jnp.sqrt(reached[top]), climbed[top]
     noise = rounding(form)
     # The cheap route needs partial fractions, and a level clear of the gain at infinity.
     cheap = trustworthy(form) & (direct < 0.999 * gain)
     higher, place, sound = sweep_modal(form, gain, tolerance, noise)
-    level = gain * (1.0 + tolerance) + noise
-    certified = (cheap & sound & (higher <= level)) | ~usable
-    start = jnp.where(higher > level, place, peak)
-    return _repair(certified, cheap & sound, form, noise, peak, start, A, B, C, D, tolerance)
+    certified = cheap & sound & (higher <= gain * (1.0 + tolerance) + noise)
+    start = jnp.where(cheap & (higher > gain), place, peak)
+    # A batch of one; `vmap` makes it longer.
+    arguments = (certified | ~usable, peak, start, noise, A, B, C, D)
+    omega, done = _repair(tolerance)(*(value[None] for value in arguments))
+    return omega[0], done[0]
 
 
 def _direct_gain(D):
     return jnp.sqrt(squared_gain(D[None].astype(complex))[0])
 
 
-def _repair(certified, cheap, form, noise, peak, start, A, B, C, D, tolerance: float):
-    """The level-set loop where the first sweep found something higher, one system at a time.
+def _repair(tolerance: float):
+    """The general level-set loop for those of a batch whose cheap certificate did not hold.
 
-    `sequential_vmap` keeps the branches branches: under a plain `vmap` every system of a batch would
-    pay for the dearest.
+    Under a plain `vmap` every system would pay for the dearest. Here the loop runs over the failed
+    ones alone, and `vmap` only makes the batch longer.
     """
 
-    @jax.custom_batching.sequential_vmap
-    def run(certified, cheap, form, noise, peak, start, A, B, C, D):
-        def by_modes(_):
-            _, omega, done = certify_by_modes(form, jnp.array(0.0), start, tolerance, noise)
-            return omega, done
-
-        def general(omega):
-            triangular = triangular_form(A, B, C, D)
-            omega = jnp.where(jnp.isfinite(omega), omega, 0.0)
-            at_start = jnp.sqrt(squared_gain(response(triangular, omega[None]))[0])
-            direct = _direct_gain(D)
-            return certify_by_hamiltonian(
-                A,
-                B,
-                C,
-                D,
-                jnp.maximum(at_start, direct),
-                jnp.where(direct >= at_start, jnp.inf, omega),
-                tolerance,
-                noise,
+    @jax.custom_batching.custom_vmap
+    def run(certified, peak, start, noise, A, B, C, D):
+        count = certified.shape[0]
+        rest = (start, noise, A, B, C, D)
+        if count == 1:
+            # Alone, or inside `lax.map`: a branch is cheaper than a list of the failed.
+            omega, done = lax.cond(
+                certified[0],
+                lambda: (peak[0], certified[0]),
+                lambda: _general(*(value[0] for value in rest), tolerance=tolerance),
             )
+            return omega[None], done[None]
+        (failed,) = jnp.nonzero(~certified, size=count, fill_value=0)
 
-        first = lax.cond(cheap & ~certified, by_modes, lambda omega: (omega, certified), peak)
-        return lax.cond(first[1], lambda omega: (omega, first[1]), general, first[0])
+        def general(position, carry):
+            omega, done = carry
+            index = failed[position]
+            found, ended = _general(*(value[index] for value in rest), tolerance=tolerance)
+            return omega.at[index].set(found), done.at[index].set(ended)
 
-    return run(certified, cheap, form, noise, peak, start, A, B, C, D)
+        return lax.fori_loop(0, jnp.sum(~certified), general, (peak, certified))
+
+    @run.def_vmap
+    def lengthen(axis_size, in_batched, *arguments):
+        longer = (
+            (value if batched else jnp.broadcast_to(value, (axis_size, *value.shape)))
+            for value, batched in zip(arguments, in_batched, strict=True)
+        )
+        omega, done = run(*(value.reshape(-1, *value.shape[2:]) for value in longer))
+        return (omega.reshape(axis_size, -1), done.reshape(axis_size, -1)), (True, True)
+
+    return run
+
+
+def _general(start, noise, A, B, C, D, *, tolerance: float):
+    omega = jnp.where(jnp.isfinite(start), start, 0.0)
+    at_start = jnp.sqrt(squared_gain(response(triangular_form(A, B, C, D), omega[None]))[0])
+    direct = _direct_gain(D)
+    gain = jnp.maximum(at_start, direct)
+    omega = jnp.where(direct >= at_start, jnp.inf, omega)
+    return certify_by_hamiltonian(A, B, C, D, gain, omega, tolerance, noise)
 
 
 @jax.custom_jvp

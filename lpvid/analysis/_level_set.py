@@ -13,7 +13,6 @@ from lpvid._types import Scalar
 from lpvid.analysis._modal import (
     Modal,
     reciprocal,
-    refine_peaks,
     response,
     squared_gain,
     triangular_form,
@@ -45,7 +44,7 @@ def secular_frequencies(form: Modal, level: Scalar) -> tuple[Float[Array, " nx"]
     heads = jnp.sum(mirrored * form.outputs[:, :, None], axis=1)
     # Bordered determinant without LU for the usual one and two inputs.
     core = -jnp.sum(mirrored[:, :, :, None] * both[1][:, :, None, :], axis=1)
-    core = core + (level * level) * jnp.eye(nu)[None].astype(core.dtype)
+    core = core + (level * level * jnp.eye(nu))[None].astype(core.dtype)
     b = form.inputs
     if nu == 1:
         bordered = -heads[:, 0] * b[:, 0]
@@ -73,7 +72,7 @@ def secular_frequencies(form: Modal, level: Scalar) -> tuple[Float[Array, " nx"]
 
     # Conjugate pairs (adjacent, positive imaginary part first, as LAPACK returns them) become real
     # 2 x 2 blocks: a real eigenproblem costs half of a complex one.
-    weights = -rho / limit
+    weights = rho * (-1.0 / limit).astype(rho.dtype)
     head = poles.imag > 0.0
     tail = poles.imag < 0.0
     spread = jnp.sqrt(jnp.abs(weights))
@@ -90,7 +89,7 @@ def secular_frequencies(form: Modal, level: Scalar) -> tuple[Float[Array, " nx"]
     # Check what was computed: every root has to be one, and pairs have to be pairs.
     inverse = reciprocal(roots[:, None] - squares[None, :])
     terms = inverse * rho[None, :]
-    value = limit + jnp.sum(terms, axis=1)
+    value = limit.astype(terms.dtype) + jnp.sum(terms, axis=1)
     slope = jnp.sum(terms * inverse, axis=1)
     error = jnp.abs(value) <= 1e-6 * jnp.maximum(
         jnp.abs(slope) * jnp.abs(roots), 1e-6 * (jnp.abs(limit) + jnp.sum(jnp.abs(terms), axis=1))
@@ -119,36 +118,6 @@ def sweep_modal(
     gains = squared_gain(response(form, trial))
     best = jnp.argmax(gains)
     return jnp.sqrt(gains[best]), trial[best], sound
-
-
-def certify_by_modes(
-    form: Modal,
-    gain: Scalar,
-    omega: Scalar,
-    tolerance: float,
-    noise: Scalar,
-    max_steps: int = 8,
-) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
-    """`certify_by_hamiltonian` on the partial fractions, from the gain at `omega`.
-
-    Returns gain, frequency and whether it is proven.
-    """
-
-    def climb(carry):
-        _, omega, _, _, steps = carry
-        width = jnp.min(jnp.abs(lax.complex(-form.poles.real, omega - form.poles.imag)))
-        climbed, reached = refine_peaks(form, omega[None], width[None], 8)
-        gain = jnp.sqrt(reached[0])
-        higher, place, sound = sweep_modal(form, gain, tolerance, noise)
-        done = higher <= gain * (1.0 + tolerance) + noise
-        omega = jnp.where(done | ~sound, climbed[0], place)
-        return gain, omega, done, sound, steps + 1
-
-    start = (gain, omega, jnp.array(False), jnp.array(True), jnp.array(0))
-    gain, omega, done, sound, _ = lax.while_loop(
-        lambda carry: ~carry[2] & carry[3] & (carry[4] < max_steps), climb, start
-    )
-    return gain, omega, done & sound
 
 
 def hamiltonian(
@@ -192,10 +161,11 @@ def certify_by_hamiltonian(
     B, C, D = B / scale_b, C / scale_c, D / size
     # Where the peak is at infinity I - D^T D / gain^2 is singular at the level. s -> 1/s maps the
     # axis onto itself and brings G(0) to infinity, which is better if the gain there is smaller.
-    static = -jnp.linalg.solve(A, B)
-    at_zero = D + C @ static
-    flip = (_largest(D) > 0.9 * gain / size) & (_largest(at_zero) < _largest(D))
     inverse = jnp.linalg.inv(A)
+    static = -inverse @ B
+    at_zero = D + C @ static
+    ends = jnp.sqrt(squared_gain(jnp.stack([D, at_zero]).astype(complex)))
+    flip = (ends[0] > 0.9 * gain / size) & (ends[1] < ends[0])
     A, B, C, D = (
         jnp.where(flip, new, old)
         for new, old in ((inverse, A), (-static, B), (C @ (-inverse), C), (at_zero, D))
@@ -210,14 +180,11 @@ def certify_by_hamiltonian(
         trial = between(jnp.where(jnp.isfinite(crossings), crossings, 0.0))
         gains = squared_gain(response(form, trial))
         best = jnp.argmax(gains)
-        start = trial[best][None]
-        width = jnp.max(jnp.abs(jnp.diff(jnp.sort(crossings)))) * jnp.ones(1)
-        climbed, reached = refine_peaks(form, start, 1e-3 * width, 8)
-        reached = jnp.sqrt(jnp.where(jnp.isfinite(reached), reached, 0.0))[0]
+        reached = jnp.sqrt(gains[best])
         higher = reached > level
         return (
             jnp.where(higher, reached, gain),
-            jnp.where(higher, climbed[0], omega),
+            jnp.where(higher, trial[best], omega),
             ~higher,
             steps + 1,
         )
@@ -227,7 +194,3 @@ def certify_by_hamiltonian(
         lambda carry: ~carry[2] & (carry[3] < max_steps), sweep, start
     )
     return jnp.where(flip, 1.0 / omega, omega), done
-
-
-def _largest(matrix: Float[Array, "ny nu"]) -> Scalar:
-    return jnp.linalg.norm(matrix, ord=2)

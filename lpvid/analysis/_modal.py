@@ -73,25 +73,15 @@ def triangular_form(
 
 
 def jets(
-    form: Modal | Triangular, omega: Float[Array, " frequency"]
+    form: Modal, omega: Float[Array, " frequency"]
 ) -> tuple[Complex[Array, "frequency ny nu"], ...]:
     """G(j omega) and its first and second derivatives with respect to omega."""
-    ny, nu = form.D.shape
-    count = omega.shape[0]
-    if isinstance(form, Modal):
-        first = reciprocal(lax.complex(-form.poles.real[None, :], omega[:, None] - form.poles.imag))
-        second = first * first
-        powers = jnp.concatenate([first, -1j * second, -2.0 * (second * first)])
-        terms = (powers @ form.residues).reshape(3, count, ny, nu)
-        return terms[0] + form.D[None].astype(terms.dtype), terms[1], terms[2]
-    nx = form.T.shape[0]
-    pencil = 1j * omega[:, None, None] * jnp.eye(nx)[None] - form.T[None]
-    first = jsl.solve_triangular(pencil, jnp.broadcast_to(form.B, (count, nx, nu)))
-    second = jsl.solve_triangular(pencil, first)
-    third = jsl.solve_triangular(pencil, second)
-    C = form.C[None]
-    response = C @ first + form.D[None].astype(first.dtype)
-    return response, -1j * (C @ second), -2.0 * (C @ third)
+    shape = (3, omega.shape[0], *form.D.shape)
+    first = reciprocal(lax.complex(-form.poles.real[None], omega[:, None] - form.poles.imag[None]))
+    second = first * first
+    powers = jnp.concatenate([first, -1j * second, -2.0 * (second * first)])
+    terms = (powers @ form.residues).reshape(shape)
+    return terms[0] + form.D[None].astype(terms.dtype), terms[1], terms[2]
 
 
 def response(
@@ -101,12 +91,17 @@ def response(
     ny, nu = form.D.shape
     count = omega.shape[0]
     if isinstance(form, Modal):
-        terms = reciprocal(lax.complex(-form.poles.real[None, :], omega[:, None] - form.poles.imag))
-        return (terms @ form.residues).reshape(count, ny, nu) + form.D[None].astype(terms.dtype)
-    nx = form.T.shape[0]
-    pencil = 1j * omega[:, None, None] * jnp.eye(nx)[None] - form.T[None]
-    states = jsl.solve_triangular(pencil, jnp.broadcast_to(form.B, (count, nx, nu)))
-    return form.C[None] @ states + form.D[None].astype(states.dtype)
+        terms = reciprocal(
+            lax.complex(-form.poles.real[None], omega[:, None] - form.poles.imag[None])
+        )
+        varying = (terms @ form.residues).reshape(count, ny, nu)
+    else:
+        nx = form.T.shape[0]
+        shift = omega[:, None, None] * jnp.eye(nx)[None]
+        pencils = lax.complex(jnp.zeros_like(shift), shift) - form.T[None]
+        inputs = jnp.broadcast_to(form.B, (count, nx, nu))
+        varying = form.C[None] @ jsl.solve_triangular(pencils, inputs)
+    return varying + form.D[None].astype(varying.dtype)
 
 
 def squared_gain(G: Complex[Array, "frequency ny nu"]) -> Float[Array, " frequency"]:
@@ -123,7 +118,7 @@ def squared_gain(G: Complex[Array, "frequency ny nu"]) -> Float[Array, " frequen
 
 
 def squared_gain_jet(
-    form: Modal | Triangular, omega: Float[Array, " frequency"]
+    form: Modal, omega: Float[Array, " frequency"]
 ) -> tuple[Float[Array, " frequency"], ...]:
     """Largest eigenvalue of G^H G with its first and second derivative along omega."""
     G, dG, ddG = jets(form, omega)
@@ -181,7 +176,7 @@ def _closed_form_jet(G, dG, ddG):
 
 
 def refine_peaks(
-    form: Modal | Triangular,
+    form: Modal,
     omega: Float[Array, " peak"],
     width: Float[Array, " peak"],
     steps: int,
@@ -193,23 +188,25 @@ def refine_peaks(
     """
 
     def advance(_, carry):
-        omega, width, (gain, slope, bend) = carry
-        newton = jnp.where(bend < 0.0, -slope / jnp.where(bend < 0.0, bend, 1.0), jnp.inf)
-        newton = jnp.where(bend < 0.0, newton, jnp.where(slope >= 0.0, jnp.inf, -jnp.inf))
+        omega, width, gain, slope, bend = carry
+        concave = bend < 0.0
+        uphill = jnp.where(slope >= 0.0, jnp.inf, -jnp.inf)
+        newton = jnp.where(concave, -slope / jnp.where(concave, bend, 1.0), uphill)
         step = jnp.clip(newton, -width, width)
         # The gain is even in omega, so a step across zero is reflected.
         trial = jnp.abs(omega + step)
         jet = squared_gain_jet(form, trial)
         better = jet[0] > gain
-        omega = jnp.where(better, trial, omega)
-        kept = tuple(
-            jnp.where(better, new, old) for new, old in zip(jet, (gain, slope, bend), strict=True)
-        )
         width = jnp.where(better, 2.0 * width, 0.25 * jnp.abs(step))
-        return omega, width, kept
+        old = (omega, gain, slope, bend)
+        new = (trial, *jet)
+        omega, *kept = (jnp.where(better, n, o) for n, o in zip(new, old, strict=True))
+        return omega, width, *kept
 
-    start = (omega, width, squared_gain_jet(form, omega))
-    omega, _, (gain, _, _) = lax.fori_loop(0, steps, advance, start)
+    # The first pass only evaluates: a flat parabola under an empty gain makes no step.
+    none = jnp.zeros_like(omega)
+    start = (omega, 0.5 * width, none - jnp.inf, none, none - 1.0)
+    omega, _, gain, _, _ = lax.fori_loop(0, steps + 1, advance, start)
     return omega, gain
 
 

@@ -14,7 +14,14 @@ from lpvid.analysis._hinf import (
     largest_peak,
     to_normalised_continuous,
 )
-from lpvid.analysis._modal import modal_form, refine_peaks, triangular_form, trustworthy
+from lpvid.analysis._modal import (
+    modal_form,
+    refine_peaks,
+    response,
+    squared_gain,
+    triangular_form,
+    trustworthy,
+)
 from lpvid.models import StateSpace
 
 
@@ -27,8 +34,9 @@ def peak_frequencies(
     is the certified one of `hinf_norm`. Where there are fewer than `count` maxima the highest is
     repeated. Infinite frequency (continuous systems with D) is left out, so a gain that is reached
     only there does not appear; a discrete system's Nyquist frequency is an ordinary one. No
-    derivatives: frequencies are for building grids. Works under `jit` (with `count` static) and
-    `vmap`. Systems with a pole on the stability boundary give gains without meaning.
+    derivatives: frequencies are for building grids. A system that cannot be diagonalised to working
+    precision has its other candidates listed as they are, without the climb. Works under `jit`
+    (with `count` static) and `vmap`. A pole on the stability boundary makes the gains meaningless.
 
     Args:
         system: continuous or discrete model with any leading batch axes.
@@ -75,13 +83,13 @@ def _single(A, B, C, D, *, dt: float, count: int):
     width = jnp.concatenate([jnp.zeros(1), width, 0.25 * (ordered[1:] - ordered[:-1])])
     omega, squared = lax.cond(
         trustworthy(form),
-        lambda start: refine_peaks(form, *start, 12),
-        lambda start: refine_peaks(triangular_form(*continuous), *start, 12),
+        lambda start: refine_peaks(form, start[0], start[1], 12),
+        lambda start: (start[0], squared_gain(response(triangular_form(*continuous), start[0]))),
         (omega, width),
     )
     if dt > 0.0:
         # The bilinear map sends the Nyquist frequency to infinity, which no climb reaches.
-        nyquist = jnp.linalg.norm(continuous[3], ord=2) ** 2
+        nyquist = squared_gain(continuous[3][None].astype(complex))
         omega, squared = jnp.append(omega, jnp.inf), jnp.append(squared, nyquist)
     squared = jnp.where(jnp.isfinite(squared), squared, 0.0)
     order = jnp.argsort(-squared)

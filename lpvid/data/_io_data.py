@@ -155,9 +155,9 @@ class IOData(eqx.Module):
         if kappa is None:
             raise ValueError("operating_point: the data has no kappa; give kappa= to IOData.")
         self._require_single("operating_point")
-        point = self.kappa[0]
-        if not isinstance(self.kappa, Tracer):
-            values = np.asarray(self.kappa)
+        point = kappa[0]
+        if not isinstance(kappa, Tracer):
+            values = np.asarray(kappa)
             spread = np.abs(values - values[0]).max(axis=0)
             varying = spread > 1e-9 * np.abs(values).max(axis=0)
             if varying.any():
@@ -314,7 +314,7 @@ class IOData(eqx.Module):
     def __repr__(self) -> str:
         if len(set(self.lengths)) == 1:
             records = f" x {len(self.lengths)} records" if len(self.lengths) > 1 else ""
-            size = f"{self.lengths[0]} samples{records}"
+            size = f"{max(self.lengths)} samples{records}"
         elif len(self.lengths) <= 4:
             size = f"{' + '.join(map(str, self.lengths))} samples"
         else:

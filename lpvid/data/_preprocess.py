@@ -60,7 +60,7 @@ class Undo(eqx.Module):
         """The original data.
 
         **Raises:** `ValueError` where a step that keeps samples (a trend, a filter's remainder)
-        meets other records lengths or channels than it produced.
+        meets records of other lengths or channels than it produced.
         """
         for reversal in reversed(self.reversals):
             processed = reversal.restore(processed)

@@ -35,12 +35,12 @@ class DataFactor(eqx.Module):
         outputs: $L_{33}$.
     """
 
-    inputs: Float[Array, "s*nu s*nu"]
-    instruments_inputs: Float[Array, "nz s*nu"]
-    instruments: Float[Array, "nz nz"]
-    outputs_inputs: Float[Array, "s*ny s*nu"]
-    outputs_instruments: Float[Array, "s*ny nz"]
-    outputs: Float[Array, "s*ny s*ny"]
+    inputs: Float[Array, "future_inputs future_inputs"]
+    instruments_inputs: Float[Array, "instruments future_inputs"]
+    instruments: Float[Array, "instruments instruments"]
+    outputs_inputs: Float[Array, "future_outputs future_inputs"]
+    outputs_instruments: Float[Array, "future_outputs instruments"]
+    outputs: Float[Array, "future_outputs future_outputs"]
 
 
 class Conditioning(eqx.Module):

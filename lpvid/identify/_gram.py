@@ -43,7 +43,8 @@ def lagged_products(
             1, n_chunks, lambda k, acc: acc + products(k * chunk), products(0)
         )
     total = total.reshape(_BLOCK, channels, (ahead + 1) * _BLOCK, channels)
-    return sum(total[i, :, i : i + n_lags] for i in range(_BLOCK)).transpose(1, 0, 2)
+    shifted = jnp.stack([total[i, :, i : i + n_lags] for i in range(_BLOCK)])
+    return jnp.sum(shifted, axis=0).transpose(1, 0, 2)
 
 
 def hankel_gram(
@@ -79,7 +80,8 @@ def hankel_gram(
     # R_{-τ} = R_τᵀ: one table over negative and positive lags.
     table = jnp.concatenate([lagged[:0:-1].transpose(0, 2, 1), lagged])
     shift = delay[None, :] - delay[:, None] + n_lags - 1
-    toeplitz = table[shift, channel[:, None], channel[None, :]]
+    place = (shift * channels + channel[:, None]) * channels + channel[None, :]
+    toeplitz = _take(table, place)
 
     heads = jnp.stack([w[a : a + n_lags - 1] for a in starts[:-1]])
     tails = jnp.stack([w[b - n_lags + 1 : b] for b in starts[1:]])
@@ -88,10 +90,11 @@ def hankel_gram(
     after = delay[:, None] + k[None, :]
 
     def edges(head, tail):
-        first = jnp.where(before >= 0, head[np.maximum(before, 0), channel[:, None]], 0.0)
-        inside = after < n_lags - 1
-        last = jnp.where(inside, tail[np.where(inside, after, 0), channel[:, None]], 0.0)
-        return jnp.concatenate([first, last], axis=1)
+        ends = jnp.concatenate([head, tail, jnp.zeros((1, channels))])
+        # The row of zeros stands for samples outside the record.
+        first = np.where(before >= 0, before, 2 * n_lags - 2)
+        last = np.where(after < n_lags - 1, after + n_lags - 1, 2 * n_lags - 2)
+        return _take(ends, np.concatenate([first, last], axis=1) * channels + channel[:, None])
 
     if len(lengths) <= _EDGES_AT_ONCE:
         ends = [edges(head, tail) for head, tail in zip(heads, tails, strict=True)]
@@ -103,6 +106,11 @@ def hankel_gram(
         return gram - corners @ corners.T, None
 
     return jax.lax.scan(subtract, toeplitz, (heads, tails))[0]
+
+
+def _take(values: Array, flat: np.ndarray) -> Array:
+    """Entries at known places of the flattened array; the bounds need no check at run time."""
+    return values.reshape(-1).at[flat.astype(np.int32)].get(mode="promise_in_bounds")
 
 
 def hankel_factor(

@@ -3,11 +3,13 @@
 import functools
 import math
 import warnings
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from lpvid._results import Status
@@ -109,7 +111,7 @@ def identify(
             f"PastOutputMOESP(order=6, block_rows=20)."
         )
     block_rows = resolve_block_rows(method, data)
-    traced = isinstance(data.u, jax.core.Tracer) or isinstance(data.y, jax.core.Tracer)
+    traced = isinstance(data.u, Tracer) or isinstance(data.y, Tracer)
     if traced and method.order == "auto":
         raise ValueError(
             'order="auto" looks at singular values and cannot run under jit, vmap or lax.map: '
@@ -130,7 +132,7 @@ def identify(
     return fit
 
 
-def _run(data: IOData, route: Route, settings: dict) -> dict[str, Array]:
+def _run(data: IOData, route: Route, settings: dict) -> dict[str, Any]:
     method = settings["method"]
     if method.order != "auto":
         return _whole(data.u, data.y, order=method.order, route=route, **settings)
@@ -140,7 +142,7 @@ def _run(data: IOData, route: Route, settings: dict) -> dict[str, Array]:
     return _complete(found, data.u, data.y, order=order, method=method, windows=data.lengths)
 
 
-def _as_fit(result: dict[str, Array], data: IOData) -> Fit:
+def _as_fit(result: dict[str, Any], data: IOData) -> Fit:
     result = dict(result)
     model = StateSpace(result.pop("A"), result.pop("B"), result.pop("C"), result.pop("D"), data.dt)
     return Fit(
@@ -237,8 +239,8 @@ def _whole(u, y, *, method, order, block_rows, lengths, route):
 
 
 def _free_unstable(
-    result: dict[str, Array], data: IOData, method: AbstractSubspaceMethod, block_rows: int
-) -> dict[str, Array]:
+    result: dict[str, Any], data: IOData, method: AbstractSubspaceMethod, block_rows: int
+) -> dict[str, Any]:
     """B and D of an unstable model from windows short enough that nothing grows out of bounds.
 
     The state is free at the start of every window, which is the simulation error of many short

@@ -75,7 +75,8 @@ def simulation_fit(model: StateSpace, data: IOData) -> Float[Array, " ny"]:
     moved = jnp.zeros(model.ny)
     for x0, first, last in zip(starts, bounds[:-1], bounds[1:], strict=True):
         y = data.y[first:last]
-        missed += jnp.sum((y - model.simulate(u=data.u[first:last], x0=x0)) ** 2, axis=0)
+        simulated = jnp.asarray(model.simulate(u=data.u[first:last], x0=x0))
+        missed += jnp.sum((y - simulated) ** 2, axis=0)
         moved += jnp.sum((y - jnp.mean(y, axis=0, keepdims=True)) ** 2, axis=0)
     return 100.0 * jnp.maximum(1.0 - jnp.sqrt(missed / moved), 0.0)
 

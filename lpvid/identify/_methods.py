@@ -25,7 +25,9 @@ class AbstractSubspaceMethod(eqx.Module):
     @abc.abstractmethod
     def project(
         self, factor: DataFactor
-    ) -> tuple[Float[Array, "s*ny column"], Float[Array, "s*ny s*ny"] | None]:
+    ) -> tuple[
+        Float[Array, "future_outputs column"], Float[Array, "future_outputs future_outputs"] | None
+    ]:
         """Matrix whose dominant left range is looked for, and the weight to undo.
 
         The second value is the W with W O the range of the first, or `None` for the identity.

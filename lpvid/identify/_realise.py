@@ -63,7 +63,7 @@ def move_inside(
     modulus = jnp.abs(poles)
     outside = modulus > radius
     factor = jnp.where(outside, radius / jnp.where(outside, modulus, 1.0), 1.0)
-    moved = _similar(vectors, poles * factor)
+    moved = _similar(vectors, poles * factor.astype(poles.dtype))
     return jnp.where(jnp.any(outside), moved, A), jnp.sum(outside)
 
 

@@ -140,26 +140,25 @@ def normal_equations(
     if leftover:
         more, states = piece(states, n_chunks * at_once * size, leftover)
         gram = gram + more
-    whole = _contract(lifted.within, gram, nu)
+    power = jnp.sum(y * y, axis=0)
+    whole = _contract(lifted.within, gram, nu, power)
     rest = time - n_blocks * size
     if rest == 0:
-        power = jnp.sum(y * y, axis=0)
-        return NormalEquations(*whole, power)
+        return whole
     ut, yt = u[n_blocks * size :], y[n_blocks * size :]
     padded = jnp.pad(ut.T, ((0, 0), (0, size - rest))).reshape(nu * size)
     left = jnp.concatenate([padded, states.reshape((nu + 1) * ny * nx)])
     right = jnp.concatenate([left, jnp.pad(yt, ((0, size - rest), (0, 0))).reshape(size * ny)])
-    tail = _contract(lifted.within, left[:, None] * right[None, :], nu, rest)
-    return NormalEquations(
-        *(a + b for a, b in zip(whole, tail, strict=True)), jnp.sum(y * y, axis=0)
-    )
+    last = left[:, None] * right[None, :]
+    tail = _contract(lifted.within[:, :rest], last, nu, jnp.zeros_like(power))
+    return jax.tree.map(jnp.add, whole, tail)
 
 
-def _contract(within: Array, gram: Array, nu: int, steps: int | None = None):
+def _contract(within: Array, gram: Array, nu: int, power: Array) -> NormalEquations:
     """Normal equations from the Gram matrix of [inputs, states] against [inputs, states, y]."""
-    ny, size, p, nx = within.shape
-    steps = size if steps is None else steps
-    within = within[:, :steps]
+    # Fewer steps than the block has samples: a record's end, padded to a block.
+    ny, steps, p, nx = within.shape
+    size = p - nx
     n_u, n_s = nu * size, (nu + 1) * ny * nx
 
     def per_output(block):
@@ -196,7 +195,14 @@ def _contract(within: Array, gram: Array, nu: int, steps: int | None = None):
     inputs = jnp.einsum("jtJt->jJ", among[:, :steps, :, :steps])
     across = gram[:n_u, n_u + n_s :].reshape(nu, size, size, ny)
     inputs_outputs = jnp.einsum("jttk->kj", across[:, :steps, :steps])
-    return states, states_inputs, inputs, states_outputs, inputs_outputs
+    return NormalEquations(
+        states=states,
+        states_inputs=states_inputs,
+        inputs=inputs,
+        states_outputs=states_outputs,
+        inputs_outputs=inputs_outputs,
+        outputs=power,
+    )
 
 
 def record_equations(
@@ -282,7 +288,7 @@ def solve(equations: NormalEquations, *, feedthrough: bool) -> LinearFit:
 
 def residual_power(
     equations: NormalEquations,
-    b: Float[Array, " nu*nx"],
+    b: Float[Array, " entry"],
     D: Float[Array, "ny nu"],
     x0: Float[Array, "record nx"],
 ) -> Float[Array, " ny"]:

@@ -12,7 +12,7 @@ from lpvid.mechanics._lagrangian import inertia_matrix as inertia_matrix
 from lpvid.mechanics._lagrangian import integrate as integrate
 from lpvid.mechanics._lagrangian import linearise as linearise
 from lpvid.mechanics._mass_spring_damper import MassSpringDamper as MassSpringDamper
-from lpvid.mechanics._mass_spring_damper import Modes as Modes
+from lpvid.mechanics._mass_spring_damper import UndampedModes as UndampedModes
 from lpvid.mechanics._study_records import OPERATING_POINTS as OPERATING_POINTS
 from lpvid.mechanics._study_records import StudyRecords as StudyRecords
 from lpvid.mechanics._study_records import local_records as local_records

@@ -126,7 +126,8 @@ def add_noise(
     y = jnp.asarray(y, float)
     if y.ndim < 2:
         raise ValueError(f"y has shape {y.shape}: give (time, channel), for example y[:, None].")
-    scale = jnp.std(y, axis=-2, keepdims=True) * 10.0 ** (-jnp.asarray(snr_db, float) / 20.0)
+    ratios = 10.0 ** (-jnp.broadcast_to(jnp.asarray(snr_db, float), y.shape[-1:]) / 20.0)
+    scale = jnp.std(y, axis=-2, keepdims=True) * jnp.expand_dims(ratios, range(y.ndim - 1))
     return y + scale * jax.random.normal(key, y.shape, float)
 
 

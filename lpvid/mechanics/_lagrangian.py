@@ -64,7 +64,7 @@ def accelerations(
         ...     return -9.81 * length * jnp.cos(q[0])
         >>> still = jnp.zeros(1)
         >>> accelerations(kinetic, potential, jnp.array([0.1]), still, still, 2.0)
-        Array([-0.48968275], dtype=float64)
+        Array([-0.48968...], dtype=float64)
     """
 
     dof = positions.shape[0]
@@ -118,8 +118,8 @@ def integrate(
 
     Example:
         >>> integrate(lambda x, u: u - x, jnp.zeros(1), jnp.ones((4, 1)), 0.1, every=2)
-        Array([[0.        ],
-               [0.18126909]], dtype=float64)
+        Array([[0.       ],
+               [0.1812691]], dtype=float64)
     """
     samples = inputs.shape[0]
     if substeps < 1 or every < 1:

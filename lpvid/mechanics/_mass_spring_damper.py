@@ -15,7 +15,7 @@ from lpvid.models import StateSpace
 Rows: TypeAlias = ArrayLike | Sequence[Sequence[float]]
 
 
-class Modes(eqx.Module):
+class UndampedModes(eqx.Module):
     """Undamped modes of a mass–spring–damper, in ascending frequency.
 
     Attributes:
@@ -116,7 +116,7 @@ class MassSpringDamper(eqx.Module):
             C=jnp.concatenate([identity, zero], axis=1),
         )
 
-    def modes(self) -> Modes:
+    def modes(self) -> UndampedModes:
         """Solve K v = ω² M v by the Cholesky factor of M; gradients need distinct frequencies.
 
         A negative eigenvalue (K not positive semidefinite) gives a NaN frequency.
@@ -132,4 +132,4 @@ class MassSpringDamper(eqx.Module):
         shapes = jax.scipy.linalg.solve_triangular(factor.T, vectors, lower=False)
         frequencies = jnp.sqrt(squares)
         modal_damping = jnp.einsum("ik,ij,jk->k", shapes, self.damping, shapes)
-        return Modes(frequencies, shapes, modal_damping / (2.0 * frequencies))
+        return UndampedModes(frequencies, shapes, modal_damping / (2.0 * frequencies))

@@ -76,8 +76,8 @@ def to_scipy(system: StateSpace) -> Any:
 
     Example:
         >>> from lpvid.models import StateSpace, to_scipy
-        >>> to_scipy(StateSpace([[-1.0]], [[1.0]], [[2.0]])).poles.tolist()
-        [-1.0]
+        >>> to_scipy(StateSpace([[-1.0]], [[1.0]], [[2.0]])).A.tolist()
+        [[-1.0]]
     """
     from scipy import signal
 

@@ -1,12 +1,12 @@
 """Frequency responses of models."""
 
-from jaxtyping import Array, ArrayLike, Complex
+from jaxtyping import Array, Complex
 
-from lpvid.models._state_space import StateSpace
+from lpvid.models._state_space import Numbers, StateSpace
 
 
 def frequency_response(
-    system: StateSpace, omega: ArrayLike
+    system: StateSpace, omega: Numbers
 ) -> Complex[Array, "*batch frequency ny nu"]:
     """Transfer matrix at angular frequencies; see `StateSpace.frequency_response`.
 

@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from lpvid._linalg import logm
+from lpvid._linalg import batched, expm, logm
 
 Matrices: TypeAlias = tuple[Array, Array, Array, Array]
 
@@ -44,7 +44,7 @@ class ZeroOrderHold(AbstractConversion):
 
     def discretise(self, A: Array, B: Array, C: Array, D: Array, dt: float) -> Matrices:
         """Discrete-time matrices for sample time `dt`."""
-        return (*_exponential(A, B, dt), C, D)
+        return (*_exponential(A, B, jnp.asarray(dt)), C, D)
 
     def to_continuous(self, A: Array, B: Array, C: Array, D: Array, dt: float) -> Matrices:
         """Continuous-time matrices; the poles are taken between ±π/dt.
@@ -55,7 +55,7 @@ class ZeroOrderHold(AbstractConversion):
         """
         if not isinstance(A, Tracer):
             _check_logarithm(np.asarray(A), dt)
-        return (*_logarithm(A, B, dt), C, D)
+        return (*_logarithm(A, B, jnp.asarray(dt)), C, D)
 
 
 class Tustin(AbstractConversion):
@@ -71,7 +71,7 @@ class Tustin(AbstractConversion):
 
     def discretise(self, A: Array, B: Array, C: Array, D: Array, dt: float) -> Matrices:
         """Discrete-time matrices; singular where A has a pole at 2/dt."""
-        return _bilinear(A, B, C, D, dt)
+        return _bilinear(A, B, C, D, jnp.asarray(dt))
 
     def to_continuous(self, A: Array, B: Array, C: Array, D: Array, dt: float) -> Matrices:
         """Continuous-time matrices.
@@ -87,14 +87,14 @@ class Tustin(AbstractConversion):
                     "A has a pole at z = -1, which the Tustin rule sends to infinity; use "
                     "ZeroOrderHold() or another sample time."
                 )
-        return _inverse_bilinear(A, B, C, D, dt)
+        return _inverse_bilinear(A, B, C, D, jnp.asarray(dt))
 
 
 _SIGNATURE = "(n,n),(n,m),(p,n),(p,m),()->(n,n),(n,m),(p,n),(p,m)"
 
 
 @jax.jit
-@partial(jnp.vectorize, signature=_SIGNATURE)
+@partial(batched, signature=_SIGNATURE)
 def _bilinear(A: Array, B: Array, C: Array, D: Array, dt: Array) -> Matrices:
     shift, identity = 2.0 / dt, jnp.eye(A.shape[0])
     inverse = jnp.linalg.inv(shift * identity - A)
@@ -108,7 +108,7 @@ def _bilinear(A: Array, B: Array, C: Array, D: Array, dt: Array) -> Matrices:
 
 
 @jax.jit
-@partial(jnp.vectorize, signature=_SIGNATURE)
+@partial(batched, signature=_SIGNATURE)
 def _inverse_bilinear(A: Array, B: Array, C: Array, D: Array, dt: Array) -> Matrices:
     shift, identity = 2.0 / dt, jnp.eye(A.shape[0])
     inverse = jnp.linalg.inv(identity + A)
@@ -122,20 +122,21 @@ def _inverse_bilinear(A: Array, B: Array, C: Array, D: Array, dt: Array) -> Matr
 
 
 @jax.jit
-def _exponential(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
+def _exponential(A: Array, B: Array, dt: Array) -> tuple[Array, Array]:
     nx, nu = B.shape[-2:]
     upper = jnp.concatenate([A, B], axis=-1) * dt
     lower = jnp.zeros((*A.shape[:-2], nu, nx + nu))
-    exponential = jax.scipy.linalg.expm(jnp.concatenate([upper, lower], axis=-2))
+    exponential = expm(jnp.concatenate([upper, lower], axis=-2))
     return exponential[..., :nx, :nx], exponential[..., :nx, nx:]
 
 
 @jax.jit
-def _logarithm(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
-    nx, nu = B.shape[-2:]
-    held = jnp.broadcast_to(jnp.eye(nu, nx + nu, nx), (*A.shape[:-2], nu, nx + nu))
-    logarithm = logm(jnp.concatenate([jnp.concatenate([A, B], axis=-1), held], axis=-2)) / dt
-    return logarithm[..., :nx, :nx], logarithm[..., :nx, nx:]
+@partial(batched, signature="(n,n),(n,m),()->(n,n),(n,m)")
+def _logarithm(A: Array, B: Array, dt: Array) -> tuple[Array, Array]:
+    nx, nu = B.shape
+    held = jnp.eye(nu, nx + nu, nx)
+    logarithm = logm(jnp.concatenate([jnp.concatenate([A, B], axis=1), held])) / dt
+    return logarithm[:nx, :nx], logarithm[:nx, nx:]
 
 
 def _check_logarithm(A: np.ndarray, dt: float) -> None:

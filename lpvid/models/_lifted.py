@@ -1,10 +1,13 @@
 """The lifted (blocked) simulation of constant discrete-time matrices."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from lpvid._linalg import batched
 
 
 def matrix_powers(
@@ -118,8 +121,5 @@ def simulate_lti(
         x0: first state.
     """
     block = default_block(u.shape[-2], A.shape[-1], B.shape[-1], C.shape[-2])
-    kernel = jnp.vectorize(
-        lambda A, B, C, D, u, x0: _lifted(A, B, C, D, u, x0, block),
-        signature="(n,n),(n,m),(p,n),(p,m),(t,m),(n)->(t,p)",
-    )
+    kernel = batched(partial(_lifted, block=block), "(n,n),(n,m),(p,n),(p,m),(t,m),(n)->(t,p)")
     return kernel(A, B, C, D, u, x0)

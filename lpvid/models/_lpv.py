@@ -68,7 +68,8 @@ class LPVStateSpace(eqx.Module):
         """Whether κ lies within the box of the points that the model was built from."""
         point = self._schedule(kappa)
         slack = 1e-9 * (self.kappa_high - self.kappa_low)
-        low, high = self.kappa_low - slack, self.kappa_high + slack
+        low = jnp.broadcast_to(self.kappa_low - slack, point.shape)
+        high = jnp.broadcast_to(self.kappa_high + slack, point.shape)
         return jnp.all(((point - low) >= 0) & ((high - point) >= 0), axis=-1)
 
     def simulate(

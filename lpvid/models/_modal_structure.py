@@ -69,8 +69,8 @@ class ModalStructure(AbstractStructure):
         """ϑ as frequencies (rad/s), damping ratios, C blocks, free B blocks (each mode) and D."""
         count = self.n_modes * self._per_mode
         modes = parameters[:count].reshape(self.n_modes, self._per_mode)
-        shapes = modes[:, 2 : 2 + 2 * self.n_outputs].reshape(-1, self.n_outputs, 2)
-        inputs = modes[:, 2 + 2 * self.n_outputs :].reshape(-1, 2, self.n_inputs - 1)
+        shapes = modes[:, 2 : 2 + 2 * self.n_outputs].reshape(self.n_modes, self.n_outputs, 2)
+        inputs = modes[:, 2 + 2 * self.n_outputs :].reshape(self.n_modes, 2, self.n_inputs - 1)
         direct = parameters[count:] if self.feedthrough else jnp.zeros(self.n_outputs * self.n_inputs)
         frequency, damping = jnp.exp(modes[:, 0]), jnp.exp(modes[:, 1])
         return frequency, damping, shapes, inputs, direct.reshape(self.n_outputs, -1)

@@ -99,7 +99,7 @@ def modal_form(system: StateSpace) -> StateSpace:
     """
     if isinstance(system.A, Tracer):
         raise ValueError("modal_form needs numbers: call it outside jit, vmap and grad.")
-    flat = [np.reshape(m, (-1, *m.shape[-2:])) for m in (system.A, system.B, system.C)]
+    flat = [np.asarray(m).reshape(-1, *m.shape[-2:]) for m in (system.A, system.B, system.C)]
     forms = [_modal_matrices(*each) for each in zip(*flat, strict=True)]
     A, B, C = (np.reshape(m, (*system.batch_shape, *m[0].shape)) for m in zip(*forms, strict=True))
     return StateSpace(A, B, C, system.D, dt=system.dt)

@@ -45,7 +45,9 @@ class PolynomialBasis(eqx.Module):
 
     def __call__(self, kappa: ArrayLike) -> Float[Array, "*batch basis"]:
         """Values of all basis functions at κ, shape (…, n_scheduling) → (…, size)."""
-        scaled = (jnp.asarray(kappa, float) - self.centre) / self.half_range
+        kappa = jnp.asarray(kappa, float)
+        centre = jnp.broadcast_to(self.centre, kappa.shape)
+        scaled = (kappa - centre) / jnp.broadcast_to(self.half_range, kappa.shape)
         columns = [
             jnp.prod(
                 jnp.stack([scaled[..., k] ** power for k, power in enumerate(powers)], axis=-1),

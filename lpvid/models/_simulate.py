@@ -2,16 +2,16 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from lpvid.models._state_space import StateSpace
+from lpvid.models._state_space import Numbers, StateSpace
 
 
 def simulate(
     system: StateSpace,
     *,
-    u: ArrayLike,
-    x0: ArrayLike | None = None,
+    u: Numbers,
+    x0: Numbers | None = None,
     dt: float | None = None,
     return_state: bool = False,
 ) -> Array | tuple[Array, Array]:

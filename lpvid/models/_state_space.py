@@ -1,8 +1,11 @@
 """Linear time-invariant state-space models."""
 
 import math
+from collections.abc import Sequence
+from typing import TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
@@ -10,13 +13,16 @@ from lpvid.models._hold import AbstractConversion, ZeroOrderHold
 from lpvid.models._lifted import simulate_lti
 from lpvid.models._transfer import transfer
 
+# Plain lists of numbers are welcome where arrays are.
+Numbers: TypeAlias = ArrayLike | Sequence
+
 
 class Modes(eqx.Module):
     """Natural frequencies, damping ratios and poles, sorted by frequency.
 
     Attributes:
         frequency: natural frequency |s| in rad/s.
-        damping: damping ratio −Re s / |s|.
+        damping: damping ratio −Re s / |s|, and one for a pole at s = 0.
         poles: poles s of the continuous-time (or equivalent continuous-time) model.
     """
 
@@ -25,7 +31,7 @@ class Modes(eqx.Module):
     poles: Complex[Array, "*batch nx"]
 
 
-def _matrix(name: str, value: ArrayLike) -> Array:
+def _matrix(name: str, value: Numbers) -> Array:
     array = jnp.asarray(value)
     if array.ndim < 2:
         raise ValueError(
@@ -37,19 +43,23 @@ def _matrix(name: str, value: ArrayLike) -> Array:
     return array.astype(float)
 
 
-def _block_diagonal(first: Array, second: Array) -> Array:
-    batch = jnp.broadcast_shapes(first.shape[:-2], second.shape[:-2])
-    (r1, c1), (r2, c2) = first.shape[-2:], second.shape[-2:]
-    first, second = (jnp.broadcast_to(m, (*batch, *m.shape[-2:])) for m in (first, second))
-    upper = jnp.concatenate([first, jnp.zeros((*batch, r1, c2))], axis=-1)
-    lower = jnp.concatenate([jnp.zeros((*batch, r2, c1)), second], axis=-1)
-    return jnp.concatenate([upper, lower], axis=-2)
+def _common_batch(*matrices: Array) -> list[Array]:
+    """The matrices with their leading axes broadcast, explicitly: the tests forbid promotion."""
+    batch = jnp.broadcast_shapes(*(m.shape[:-2] for m in matrices))
+    return [jnp.broadcast_to(m, (*batch, *m.shape[-2:])) for m in matrices]
 
 
 def _join(first: Array, second: Array, axis: int) -> Array:
-    batch = jnp.broadcast_shapes(first.shape[:-2], second.shape[:-2])
-    first, second = (jnp.broadcast_to(m, (*batch, *m.shape[-2:])) for m in (first, second))
-    return jnp.concatenate([first, second], axis=axis)
+    return jnp.concatenate(_common_batch(first, second), axis=axis)
+
+
+def _block_diagonal(first: Array, second: Array) -> Array:
+    first, second = _common_batch(first, second)
+    *batch, r1, c1 = first.shape
+    r2, c2 = second.shape[-2:]
+    upper = jnp.concatenate([first, jnp.zeros((*batch, r1, c2))], axis=-1)
+    lower = jnp.concatenate([jnp.zeros((*batch, r2, c1)), second], axis=-1)
+    return jnp.concatenate([upper, lower], axis=-2)
 
 
 class StateSpace(eqx.Module):
@@ -72,10 +82,10 @@ class StateSpace(eqx.Module):
 
     def __init__(
         self,
-        A: ArrayLike,
-        B: ArrayLike,
-        C: ArrayLike,
-        D: ArrayLike | None = None,
+        A: Numbers,
+        B: Numbers,
+        C: Numbers,
+        D: Numbers | None = None,
         dt: float = 0.0,
     ):
         """Build a model from its matrices.
@@ -105,16 +115,13 @@ class StateSpace(eqx.Module):
                     f"{C.shape} it must end in {expected}. Check that no matrix is transposed."
                 )
         try:
-            batch = jnp.broadcast_shapes(*(m.shape[:-2] for m in (A, B, C, D)))
+            self.A, self.B, self.C, self.D = _common_batch(A, B, C, D)
         except ValueError as error:
             shapes = ", ".join(str(m.shape) for m in (A, B, C, D))
             raise ValueError(f"The batch axes of A, B, C, D do not agree: {shapes}.") from error
         dt = float(dt)
         if not (dt >= 0.0 and math.isfinite(dt)):
             raise ValueError(f"dt is {dt}; give the sample time in seconds, or 0 (continuous).")
-        self.A, self.B, self.C, self.D = (
-            jnp.broadcast_to(m, (*batch, *m.shape[-2:])) for m in (A, B, C, D)
-        )
         self.dt = dt
 
     @property
@@ -153,8 +160,8 @@ class StateSpace(eqx.Module):
     def simulate(
         self,
         *,
-        u: ArrayLike,
-        x0: ArrayLike | None = None,
+        u: Numbers,
+        x0: Numbers | None = None,
         dt: float | None = None,
         return_state: bool = False,
     ) -> Array | tuple[Array, Array]:
@@ -210,10 +217,13 @@ class StateSpace(eqx.Module):
             raise ValueError("The model is in continuous time: give the sample time dt of u.")
         return self.discretise(dt)
 
-    def frequency_response(self, omega: ArrayLike) -> Complex[Array, "*batch frequency ny nu"]:
+    def frequency_response(self, omega: Numbers) -> Complex[Array, "*batch frequency ny nu"]:
         """Transfer matrix at the angular frequencies `omega` (rad/s)."""
         omega = jnp.atleast_1d(jnp.asarray(omega, float))
-        points = jnp.exp(1j * omega * self.dt) if self.is_discrete else 1j * omega
+        if self.is_discrete:
+            points = jax.lax.complex(jnp.cos(omega * self.dt), jnp.sin(omega * self.dt))
+        else:
+            points = jax.lax.complex(jnp.zeros_like(omega), omega)
         return transfer(self.A, self.B, self.C, self.D, points)
 
     def poles(self) -> Complex[Array, "*batch nx"]:
@@ -231,7 +241,9 @@ class StateSpace(eqx.Module):
         poles = jnp.log(poles) / self.dt if self.is_discrete else poles
         poles = jnp.take_along_axis(poles, jnp.argsort(jnp.abs(poles), axis=-1), axis=-1)
         frequency = jnp.abs(poles)
-        return Modes(frequency, -poles.real / frequency, poles)
+        moves = frequency > 0.0
+        damping = jnp.where(moves, -poles.real / jnp.where(moves, frequency, 1.0), 1.0)
+        return Modes(frequency, damping, poles)
 
     def dc_gain(self) -> Float[Array, "*batch ny nu"]:
         """Transfer matrix at frequency zero; not finite for a model with an integrator."""
@@ -258,13 +270,13 @@ class StateSpace(eqx.Module):
         method = ZeroOrderHold() if method is None else method
         return StateSpace(*method.to_continuous(self.A, self.B, self.C, self.D, self.dt))
 
-    def transform(self, T: ArrayLike) -> "StateSpace":
+    def transform(self, T: Numbers) -> "StateSpace":
         """The same model in the states T x: (T A T⁻¹, T B, C T⁻¹, D)."""
         T = _matrix("T", T)
         if T.shape[-2:] != (self.nx, self.nx):
             raise ValueError(f"T has shape {T.shape}; ({self.nx}, {self.nx}) is needed.")
-        right = _join((T @ self.A).mT, self.C.mT, axis=-1)
-        solved = jnp.linalg.solve(T.mT, right).mT
+        T, A, C = _common_batch(T, self.A, self.C)
+        solved = jnp.linalg.solve(T.mT, _join((T @ A).mT, C.mT, axis=-1)).mT
         return StateSpace(
             solved[..., : self.nx, :], T @ self.B, solved[..., self.nx :, :], self.D, dt=self.dt
         )
@@ -291,7 +303,7 @@ class StateSpace(eqx.Module):
             _block_diagonal(self.A, other.A),
             _join(self.B, other.B, axis=-2),
             _join(self.C, other.C, axis=-1),
-            self.D + other.D,
+            sum(_common_batch(self.D, other.D)),
             dt=self.dt,
         )
 
@@ -316,7 +328,7 @@ class StateSpace(eqx.Module):
         beside = jnp.zeros((*coupling.shape[:-2], self.nx, self.nx))
         corner = _join(above, _join(coupling, beside, axis=-1), axis=-2)
         return StateSpace(
-            _block_diagonal(other.A, self.A) + corner,
+            sum(_common_batch(_block_diagonal(other.A, self.A), corner)),
             _join(other.B, self.B @ other.D, axis=-2),
             _join(self.D @ other.C, self.C, axis=-1),
             self.D @ other.D,

@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from lpvid._linalg import batched
+
 # Up to this many entries of [[A, B], [C, D]] the tangents are one real product with the Jacobian.
 _JACOBIAN_ENTRIES = 400
 
@@ -20,9 +22,17 @@ def _transfer(
     # level with a complex Schur form and back substitution, and 1.5 to 20 times faster than an
     # elimination vectorised over the frequencies. It is also the one that never needs pivoting by
     # hand or well-conditioned eigenvectors.
-    shifted = points[:, None, None] * jnp.eye(A.shape[0]) - A[None]
-    right = jnp.broadcast_to(B[None], (points.shape[0], *B.shape)).astype(points.dtype)
-    return C.astype(points.dtype)[None] @ jnp.linalg.solve(shifted, right) + D[None]
+    dtype = points.dtype
+    right = jnp.broadcast_to(B.astype(dtype)[None], (points.shape[0], *B.shape))
+    solved = jnp.linalg.solve(_shifted(A, points), right)
+    return C.astype(dtype)[None] @ solved + D.astype(dtype)[None]
+
+
+def _shifted(
+    A: Float[Array, "nx nx"], points: Complex[Array, " frequency"]
+) -> Complex[Array, "frequency nx nx"]:
+    identity = jnp.eye(A.shape[0], dtype=points.dtype)
+    return points[:, None, None] * identity[None] - A.astype(points.dtype)[None]
 
 
 @_transfer.defjvp
@@ -34,10 +44,10 @@ def _transfer_jvp(primals, tangents):
     dA, dB, dC, dD, dpoints = tangents
     count, ny, nu = points.shape[0], C.shape[0], B.shape[1]
     dtype = points.dtype
-    resolvent = jnp.linalg.inv(points[:, None, None] * jnp.eye(A.shape[0]) - A[None])
+    resolvent = jnp.linalg.inv(_shifted(A, points))
     X = resolvent @ B.astype(dtype)[None]
     Y = C.astype(dtype)[None] @ resolvent
-    G = C.astype(dtype)[None] @ X + D[None]
+    G = C.astype(dtype)[None] @ X + D.astype(dtype)[None]
     identity_y = jnp.broadcast_to(jnp.eye(ny, dtype=dtype)[None], (count, ny, ny))
     identity_u = jnp.broadcast_to(jnp.eye(nu, dtype=dtype)[None], (count, nu, nu))
     left = jnp.concatenate([Y, identity_y], axis=2)
@@ -74,6 +84,4 @@ def transfer(
         D: feedthrough.
         points: points of the complex plane, 1/s (or dimensionless z).
     """
-    return jnp.vectorize(_transfer, signature="(n,n),(n,m),(p,n),(p,m),(f)->(f,p,m)")(
-        A, B, C, D, points
-    )
+    return batched(_transfer, "(n,n),(n,m),(p,n),(p,m),(f)->(f,p,m)")(A, B, C, D, points)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeAlias, TypeVar
 
 import numpy as np
+from jaxtyping import ArrayLike
 
 from lpvid._files import write_atomically
 
@@ -19,6 +20,9 @@ else:
     Axes: TypeAlias = Any
     Figure: TypeAlias = Any
 
+# Numbers to draw: arrays, or plain lists of them.
+Values: TypeAlias = ArrayLike | Sequence[Any]
+
 # Okabe and Ito's colours, told apart with any colour vision, those strong on white first.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000")
 DATA_COLOUR = "#333333"
@@ -28,7 +32,7 @@ FAINT = "#8C8C8C"
 DASHES = ("-", (0, (6, 2)), (0, (2, 1.2)), (0, (6, 2, 1.5, 2)), (0, (9, 2, 2, 2, 2, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.size": 9.0,
     "axes.titlesize": 9.0,
     "axes.titleweight": "bold",
@@ -69,15 +73,9 @@ def grid_of_axes(
     if axes is None:
         import matplotlib.pyplot as plt
 
-        _, made = plt.subplots(
-            rows,
-            columns,
-            figsize=size,
-            sharex=sharex,  # pyright: ignore[reportArgumentType]
-            squeeze=False,
-            layout="constrained",
-            height_ratios=height_ratios,
-        )
+        options: dict[str, Any] = {"figsize": size, "sharex": sharex, "squeeze": False}
+        options |= {"layout": "constrained", "height_ratios": height_ratios}
+        _, made = plt.subplots(rows, columns, **options)
         return made
     given = np.atleast_1d(np.asarray(axes, dtype=object))
     if given.size != rows * columns:
@@ -99,7 +97,20 @@ def dress(axes: Axes) -> None:
 def legend(axes: Axes, **options: Any) -> None:
     """Legend where something is labelled, on a translucent ground."""
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(framealpha=0.85, edgecolor="none", **options)
+        made = axes.legend(framealpha=0.85, edgecolor="none", **options)
+        # The sign of a translucent cloud would not be seen in the legend.
+        for handle in made.legend_handles:
+            if handle is not None and hasattr(handle, "get_marker"):
+                handle.set_alpha(1.0)
+
+
+def legend_above(axes: Axes) -> None:
+    """Legend above the axes, where it hides nothing, in as many columns as fit."""
+    labels = axes.get_legend_handles_labels()[1]
+    longest = max((len(label) for label in labels), default=0)
+    columns = max(1, min(len(labels), 100 // (longest + 8)))
+    place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0)}
+    legend(axes, ncols=columns, borderaxespad=0.1, borderpad=0.2, **place)
 
 
 def with_unit(name: str, unit: str) -> str:

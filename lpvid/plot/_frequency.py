@@ -4,29 +4,26 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike
 
 from lpvid.models import StateSpace
 from lpvid.plot._figure import (
     Axes,
+    Values,
     channel_names,
     colour,
     dashes,
     dress,
     grid_of_axes,
-    labelled,
     legend,
-    model_of,
     styled,
 )
-
-_HZ = 2.0 * np.pi
+from lpvid.plot._systems import HZ, continuous_poles, response_of, state_spaces
 
 
 @styled
 def bode(
     systems: Any,
-    omega: ArrayLike | None = None,
+    omega: Values | None = None,
     labels: Sequence[str] | str | None = None,
     *,
     phase: bool = False,
@@ -55,10 +52,11 @@ def bode(
 
         bode([fit.model, truth], labels=["identified", "truth"])
     """
-    models = _models(systems, labels)
+    models = state_spaces(systems, labels)
     ny, nu = _common_size(models)
     inputs = channel_names(input_names, nu, "u", "input_names")
     outputs = channel_names(output_names, ny, "y", "output_names")
+    responses = _responses(models, omega)
     rows = 2 if phase else 1
     panels = grid_of_axes(
         rows * ny,
@@ -70,20 +68,21 @@ def bode(
     )
     for panel in panels.ravel():
         dress(panel)
-    for index, (label, model) in enumerate(models.items()):
-        grid = _grid(omega, model, models)
-        response = _response(model, grid)
+    for index, (label, (grid, response)) in enumerate(responses.items()):
         look = _look(index, response.shape[0])
         for (k, j), panel in np.ndenumerate(panels[::rows]):
             for member, one in enumerate(response[:, :, k, j]):
                 name = label if member == 0 else "_"
-                panel.plot(grid / _HZ, _magnitude(one, decibels), label=name, **look)
+                panel.plot(grid / HZ, _magnitude(one, decibels), label=name, **look)
                 if phase:
-                    panels[rows * k + 1, j].plot(grid / _HZ, _phase(one), **look)
+                    below: Any = panels[rows * k + 1, j]
+                    below.plot(grid / HZ, _phase(one), **look)
     for (k, j), panel in np.ndenumerate(panels):
         panel.set_xscale("log")
         is_phase = phase and k % 2 == 1
-        if not is_phase and not decibels:
+        if is_phase:
+            panel.yaxis.set_major_locator(_quarter_turns())
+        elif not decibels:
             panel.set_yscale("log")
         if j == 0:
             quantity = "phase (deg)" if is_phase else _magnitude_label(decibels)
@@ -100,7 +99,7 @@ def bode(
 @styled
 def singular_values(
     systems: Any,
-    omega: ArrayLike | None = None,
+    omega: Values | None = None,
     labels: Sequence[str] | str | None = None,
     *,
     decibels: bool = True,
@@ -114,19 +113,18 @@ def singular_values(
 
         singular_values({"error": best.model - fit_continuous})
     """
-    models = _models(systems, labels)
+    models = state_spaces(systems, labels)
+    responses = _responses(models, omega)
     panel = grid_of_axes(1, 1, axes, size=(6.0, 3.6))[0, 0]
     dress(panel)
-    for index, (label, model) in enumerate(models.items()):
-        grid = _grid(omega, model, models)
-        response = _response(model, grid)
+    for index, (label, (grid, response)) in enumerate(responses.items()):
         look = _look(index, response.shape[0])
         values = np.linalg.svd(response, compute_uv=False)
         for member in range(values.shape[0]):
             for order in range(values.shape[-1]):
                 name = label if member == order == 0 else "_"
                 curve = _magnitude(values[member, :, order], decibels)
-                panel.plot(grid / _HZ, curve, label=name, **look)
+                panel.plot(grid / HZ, curve, label=name, **look)
     panel.set_xscale("log")
     if not decibels:
         panel.set_yscale("log")
@@ -135,19 +133,6 @@ def singular_values(
     if len(models) > 1 or labels is not None:
         legend(panel)
     return panel
-
-
-def _models(systems: Any, labels: Sequence[str] | str | None) -> dict[str, StateSpace]:
-    models = {}
-    for label, item in labelled(systems, labels, "systems", "system").items():
-        model = model_of(item)
-        if not isinstance(model, StateSpace):
-            raise ValueError(
-                f"systems: {label!r} is a {type(item).__name__}; give state-space models (of an "
-                "LPV model lpv.at(kappa))."
-            )
-        models[label] = model
-    return models
 
 
 def _common_size(models: dict[str, StateSpace]) -> tuple[int, int]:
@@ -171,23 +156,30 @@ def _look(index: int, members: int) -> dict[str, Any]:
     }
 
 
-def _response(model: StateSpace, omega: np.ndarray) -> np.ndarray:
-    """Response with all batch axes as one in front: (member, frequency, ny, nu)."""
-    response = np.asarray(model.frequency_response(omega))
-    return response.reshape(-1, *response.shape[-3:])
+def _responses(
+    models: dict[str, StateSpace], omega: Values | None
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Label → frequencies in rad/s, response (member, frequency, ny, nu)."""
+    grids = {label: _grid(omega, model, models) for label, model in models.items()}
+    return {label: (grid, response_of(models[label], grid)) for label, grid in grids.items()}
 
 
-def _grid(omega: ArrayLike | None, model: StateSpace, models: dict[str, StateSpace]) -> np.ndarray:
+def _grid(omega: Values | None, model: StateSpace, models: dict[str, StateSpace]) -> np.ndarray:
     """Frequencies to draw `model` at, in rad/s, up to its Nyquist frequency."""
     nyquist = np.pi / model.dt if model.is_discrete else np.inf
     if omega is not None:
         given = np.atleast_1d(np.asarray(omega, float))
         if given.ndim != 1 or not np.all(given >= 0):
             raise ValueError("omega: a one-dimensional array of frequencies from 0 is needed.")
-        return given[given <= nyquist * (1 + 1e-9)]
+        given = given[given <= nyquist * (1 + 1e-9)]
+        if given.size == 0:
+            raise ValueError(
+                f"omega: none lies below the Nyquist frequency, {nyquist:.4g} rad/s, of a system."
+            )
+        return given
     low, high = _range(models)
     grid = np.geomspace(low, high, 400)
-    poles = _continuous_poles(model)
+    poles = continuous_poles(model).ravel()
     # A sharp peak between two points of a plain grid would be cut off.
     upper = poles[poles.imag > 0]
     around = np.linspace(-4.0, 4.0, 17)
@@ -204,7 +196,7 @@ def _range(models: dict[str, StateSpace]) -> tuple[float, float]:
     """From a decade below the slowest pole to a decade above the fastest, in rad/s."""
     lows, highs = [], []
     for model in models.values():
-        sizes = np.abs(_continuous_poles(model))
+        sizes = np.abs(continuous_poles(model).ravel())
         nyquist = np.pi / model.dt if model.is_discrete else np.inf
         # Integrators and deadbeat poles say nothing about the frequencies of interest.
         sizes = sizes[np.isfinite(sizes) & (sizes > 1e-9 * np.max(sizes, initial=0.0))]
@@ -218,13 +210,6 @@ def _range(models: dict[str, StateSpace]) -> tuple[float, float]:
     return float(min(low, 0.1 * high)), float(high)
 
 
-def _continuous_poles(model: StateSpace) -> np.ndarray:
-    poles = np.asarray(model.poles()).ravel()
-    if model.is_discrete:
-        poles = np.log(poles[poles != 0].astype(complex)) / model.dt
-    return poles
-
-
 def _magnitude(response: np.ndarray, decibels: bool) -> np.ndarray:
     size = np.abs(response)
     size = np.where(size > 0, size, np.nan)
@@ -233,6 +218,12 @@ def _magnitude(response: np.ndarray, decibels: bool) -> np.ndarray:
 
 def _magnitude_label(decibels: bool) -> str:
     return "magnitude (dB)" if decibels else "magnitude"
+
+
+def _quarter_turns() -> Any:
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(nbins=5, steps=[1, 1.8, 3.6, 4.5, 9, 10])
 
 
 def _phase(response: np.ndarray) -> np.ndarray:

@@ -4,24 +4,24 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import numpy as np
-from jaxtyping import ArrayLike
 
 from lpvid.models import LPVStateSpace
-from lpvid.plot._figure import REFERENCE_COLOUR, colour, dress, grid_of_axes, styled
+from lpvid.plot._figure import REFERENCE_COLOUR, Values, colour, dress, grid_of_axes, styled
 
 
 @styled
 def parameters(
     lpv: LPVStateSpace,
-    kappas: ArrayLike | None = None,
+    kappas: Values | None = None,
     parameters: Any = None,
-    reference: Callable[[Any], ArrayLike] | ArrayLike | None = None,
+    reference: Callable[[Any], Values] | Values | None = None,
     names: Sequence[str] | None = None,
     *,
     which: Sequence[int] | None = None,
     along: int = 0,
-    at: ArrayLike | None = None,
+    at: Values | None = None,
     name: str | None = None,
     axes: Any = None,
 ) -> np.ndarray:
@@ -56,7 +56,7 @@ def parameters(
     middle = (low + high) / 2.0 if at is None else np.atleast_1d(np.asarray(at, float))
     grid = np.tile(middle, (101, 1))
     grid[:, along] = np.linspace(low[along], high[along], 101)
-    curves = np.asarray(lpv.parameters(grid))
+    curves = np.asarray(jax.vmap(lpv.parameters)(grid))
     exact = _reference(reference, grid, points, along, count)
     panels = _panels(len(chosen), axes)
     for panel, index in zip(panels, chosen, strict=True):
@@ -124,7 +124,7 @@ def _panels(count: int, axes: Any) -> np.ndarray:
     return made.ravel()[:count]
 
 
-def _points(kappas: ArrayLike | None, n_scheduling: int) -> np.ndarray | None:
+def _points(kappas: Values | None, n_scheduling: int) -> np.ndarray | None:
     if kappas is None:
         return None
     points = np.asarray(kappas, float)

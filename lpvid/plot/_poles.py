@@ -1,10 +1,11 @@
 """Poles in the plane, and mode frequencies over the scheduling."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
+import jax
 import numpy as np
-from jaxtyping import ArrayLike
+from numpy.typing import NDArray
 
 from lpvid.models import LPVStateSpace, StateSpace
 from lpvid.plot._figure import (
@@ -12,8 +13,8 @@ from lpvid.plot._figure import (
     MARKERS,
     REFERENCE_COLOUR,
     Axes,
+    Values,
     colour,
-    dashes,
     dress,
     grid_of_axes,
     labelled,
@@ -21,8 +22,8 @@ from lpvid.plot._figure import (
     model_of,
     styled,
 )
+from lpvid.plot._systems import HZ, continuous_poles, plane_poles, state_spaces
 
-_HZ = 2.0 * np.pi
 _DAMPINGS = (0.05, 0.1, 0.3, 0.7)
 
 
@@ -44,10 +45,7 @@ def poles(
 
         poles({"identified": fit.model, "truth": truth})
     """
-    models = {
-        label: model_of(item)
-        for label, item in labelled(systems, labels, "systems", "system").items()
-    }
+    models = state_spaces(systems, labels)
     discrete = {model.is_discrete for model in models.values()}
     if len(discrete) > 1:
         raise ValueError(
@@ -58,8 +56,8 @@ def poles(
     dress(panel)
     is_discrete = discrete.pop()
     for index, (label, model) in enumerate(models.items()):
-        values = np.asarray(model.poles()).ravel()
-        values = values if is_discrete else values / _HZ
+        values = plane_poles(model).ravel()
+        values = values if is_discrete else values / HZ
         cloud = len(model.batch_shape) > 0
         panel.plot(
             values.real,
@@ -94,15 +92,13 @@ def _unit_circle(panel: Axes) -> None:
 
 
 def _damping_lines(panel: Axes) -> None:
-    left, right = panel.get_xlim()
-    low, high = panel.get_ylim()
-    width = max(right - left, 1e-12)
-    # Both axes through the origin, and a strip of the unstable side, whatever the poles are.
-    left, right = min(left, -0.05 * width), max(right, 0.08 * width)
-    reach = max(abs(low), abs(high))
-    if reach <= 0.06:  # Matplotlib's limits about real poles alone
-        reach = 0.5 * (right - left)
+    (left, right), (low, high) = panel.dataLim.intervalx, panel.dataLim.intervaly
+    width = max(right, 0.0) - min(left, 0.0) or 1.0
+    # The origin and a strip of the unstable side are always shown, and room beside the poles.
+    left, right = min(1.1 * left, -0.05 * width), max(1.1 * right, 0.08 * width)
+    reach = 1.12 * max(abs(low), abs(high)) or 0.5 * width
     low, high = -reach, reach
+    labelled_at = np.inf
     for damping in _DAMPINGS:
         slope = np.sqrt(1.0 - damping**2) / damping
         # The ray ends where it meets the left or the upper edge.
@@ -117,6 +113,9 @@ def _damping_lines(panel: Axes) -> None:
                 label=f"_damping {damping:g}",
                 zorder=1,
             )
+        if abs(labelled_at - abs(slope * end)) < 0.06 * reach:
+            continue
+        labelled_at = abs(slope * end)
         panel.annotate(
             f"ζ = {damping:g}",
             (end, -slope * end),
@@ -138,7 +137,7 @@ def _damping_lines(panel: Axes) -> None:
 @styled
 def mode_frequencies(
     systems: Any,
-    kappas: ArrayLike | None = None,
+    kappas: Values | None = None,
     labels: Sequence[str] | str | None = None,
     *,
     damping: bool = False,
@@ -172,15 +171,18 @@ def mode_frequencies(
     points = points[:, None] if points is not None and points.ndim == 1 else points
     if isinstance(systems, list | tuple) and labels is None:
         systems = {"local models": systems}  # a plain list of local models is one system
+    found = labelled(systems, labels, "systems", "model")
+    curves = [
+        (label, *_along_kappa(system, label, points, along, index))
+        for index, (label, system) in enumerate(found.items())
+    ]
     rows = 2 if damping else 1
     panels = grid_of_axes(rows, 1, axes, size=(6.0, 1.0 + 2.4 * rows), sharex=True)[:, 0]
     for panel in panels:
         dress(panel)
-    found = labelled(systems, labels, "systems", "model")
-    for index, (label, system) in enumerate(found.items()):
-        where, models, look = _along_kappa(system, label, points, along, index)
-        frequency, ratio = _modes(models)
-        for panel, values in zip(panels, (frequency / _HZ, ratio), strict=False):
+    for label, where, poles_there, look in curves:
+        frequency, ratio = _modes(poles_there)
+        for panel, values in zip(panels, (frequency / HZ, ratio), strict=False):
             for rank, curve in enumerate(values.T):
                 panel.plot(where, curve, label=label if rank == 0 else "_", **look)
     panels[0].set_ylabel("mode frequency (Hz)")
@@ -197,21 +199,21 @@ def mode_frequencies(
 
 def _along_kappa(
     system: Any, label: str, points: np.ndarray | None, along: int, index: int
-) -> tuple[np.ndarray, list[StateSpace], dict[str, Any]]:
-    """κ, the models there, and how they are drawn."""
+) -> tuple[np.ndarray, list[NDArray[np.complex128]], dict[str, Any]]:
+    """κ, the poles there (rad/s), and how they are drawn."""
     if isinstance(system, LPVStateSpace):
         low, high = np.asarray(system.kappa_low), np.asarray(system.kappa_high)
         grid = _line(low, high, along)
-        look = {"color": colour(index), "linestyle": dashes(index), "linewidth": 1.4}
-        return grid[:, along], [system.at(kappa) for kappa in grid], look
+        look = {"color": colour(index), "linewidth": 1.4}
+        return grid[:, along], list(continuous_poles(jax.vmap(system.at)(grid))), look
     if points is None:
         raise ValueError(f"kappas: needed for {label!r}, to know where its models are.")
     if callable(system) and not isinstance(system, list | tuple):
-        function: Callable[[Any], StateSpace] = system
+        function = cast(Callable[[Any], StateSpace], system)
         grid = _line(points.min(axis=0), points.max(axis=0), along)
-        look = {"color": REFERENCE_COLOUR, "linestyle": "--", "linewidth": 1.0, "zorder": 1.5}
+        look = {"color": REFERENCE_COLOUR, "linestyle": "--", "linewidth": 1.0}
         arguments = grid[:, 0] if grid.shape[1] == 1 else grid
-        return grid[:, along], [function(kappa) for kappa in arguments], look
+        return grid[:, along], [continuous_poles(function(kappa)) for kappa in arguments], look
     models = [model_of(item) for item in system]
     if len(models) != points.shape[0]:
         raise ValueError(
@@ -223,7 +225,7 @@ def _along_kappa(
         "marker": MARKERS[index % len(MARKERS)],
         "markersize": 5.0,
     }
-    return points[:, along], models, look
+    return points[:, along], [continuous_poles(model) for model in models], look
 
 
 def _line(low: np.ndarray, high: np.ndarray, along: int) -> np.ndarray:
@@ -233,18 +235,15 @@ def _line(low: np.ndarray, high: np.ndarray, along: int) -> np.ndarray:
     return grid
 
 
-def _modes(models: list[StateSpace]) -> tuple[np.ndarray, np.ndarray]:
-    """Frequency (rad/s) and damping by rank, shape (models, modes), NaN where there are fewer."""
+def _modes(poles_there: list[NDArray[np.complex128]]) -> tuple[np.ndarray, np.ndarray]:
+    """Frequency (rad/s) and damping by rank, shape (points, modes), NaN where there are fewer."""
     upper = []
-    for model in models:
-        values = np.asarray(model.poles())
-        if model.is_discrete:
-            values = np.log(values.astype(complex)) / model.dt
+    for values in poles_there:
         # Rounding gives a double real pole a tiny imaginary part.
-        values = values[values.imag > 1e-9 * np.abs(values)]
+        values = values[np.isfinite(values) & (values.imag > 1e-9 * np.abs(values))]
         upper.append(values[np.argsort(np.abs(values))])
     count = max((values.size for values in upper), default=0)
-    frequency, damping = np.full((2, len(models), count), np.nan)
+    frequency, damping = np.full((2, len(poles_there), count), np.nan)
     for row, values in enumerate(upper):
         frequency[row, : values.size] = np.abs(values)
         damping[row, : values.size] = -values.real / np.abs(values)

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import scipy.signal
-from jaxtyping import ArrayLike
 
 from lpvid.plot._figure import (
     DATA_COLOUR,
     FAINT,
+    Values,
     channel_names,
     colour,
     dress,
@@ -22,8 +22,8 @@ from lpvid.plot._figure import (
 
 @styled
 def residuals(
-    y: ArrayLike,
-    y_hat: ArrayLike,
+    y: Values,
+    y_hat: Values,
     dt: float,
     *,
     names: Sequence[str] | None = None,
@@ -40,7 +40,7 @@ def residuals(
 
     - `y`, `y_hat`: measured and simulated, shape (time,) or (time, ny), one record.
     - `dt`: sample time in seconds.
-    - `lags`: how many lags are shown, at most half the record.
+    - `lags`: how many lags are shown, from 1, at most half the record.
 
     Returns the axes, shape (ny, 3).
 
@@ -68,7 +68,7 @@ def residuals(
         time.plot(dt * np.arange(count), residual[:, k], color=colour(1), linewidth=0.8)
         time.margins(x=0.01)
         time.set_title(f"residual of {outputs[k]}", loc="left")
-        time.set_ylabel(with_unit(f"residual of {outputs[k]}", unit[k]))
+        time.set_ylabel(with_unit("residual", unit[k]))
         _draw_autocorrelation(lag, residual[:, k], min(lags, count // 2))
         _draw_spectrum(spectrum, measured[:, k], residual[:, k], dt, unit[k])
     panels[-1, 0].set_xlabel("time (s)")
@@ -78,14 +78,16 @@ def residuals(
 
 
 def _draw_autocorrelation(panel: Any, residual: np.ndarray, lags: int) -> None:
-    values = _autocorrelation(residual, lags)
+    # Lag 0 is 1 for any signal: without it the rest has room.
+    values = _autocorrelation(residual, lags)[1:]
+    lag = np.arange(1, lags + 1)
     band = 1.96 / np.sqrt(residual.size)
     panel.axhspan(
         -band, band, color=colour(0), alpha=0.18, linewidth=0, label="95 % of white noise"
     )
-    panel.vlines(np.arange(lags + 1), 0.0, values, color=colour(1), linewidth=1.0)
+    panel.vlines(lag, 0.0, values, color=colour(1), linewidth=1.0)
     panel.plot(
-        np.arange(lags + 1),
+        lag,
         values,
         linestyle="none",
         marker="o",
@@ -94,6 +96,9 @@ def _draw_autocorrelation(panel: Any, residual: np.ndarray, lags: int) -> None:
         label="_autocorrelation",
     )
     panel.axhline(0.0, color=FAINT, linewidth=0.8)
+    # Room around the band, so that a white residual is seen to lie well inside.
+    reach = np.nanmax(np.append(np.abs(values), 2.0 * band)) * 1.1
+    panel.set_ylim(-reach, reach)
     panel.set_title("autocorrelation", loc="left")
     legend(panel, loc="upper right")
 
@@ -115,11 +120,12 @@ def _draw_spectrum(
         (measured, "measured", DATA_COLOUR),
         (residual, "residual", colour(1)),
     ):
-        segment = min(signal.size, 1024)
+        segment = min(signal.size, max(16, min(signal.size // 4, 1024)))
         frequency, power = scipy.signal.welch(signal, fs=1.0 / dt, nperseg=segment)
         shown = np.where(power[1:] > 0, power[1:], np.nan)
         panel.plot(frequency[1:], shown, color=shade, linewidth=0.9, label=label)
     panel.set_xscale("log")
     panel.set_yscale("log")
-    panel.set_title(with_unit("power spectral density", f"{unit}²/Hz" if unit else ""), loc="left")
+    density = f", ({unit})²/Hz" if unit else ""
+    panel.set_title(f"power spectral density{density}", loc="left")
     legend(panel, loc="lower left")

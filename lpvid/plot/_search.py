@@ -4,20 +4,24 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike
 
 from lpvid.plot._figure import (
     FAINT,
     MARKERS,
     Axes,
+    Values,
     channel_names,
     colour,
     dress,
     grid_of_axes,
     labelled,
     legend,
+    legend_above,
     styled,
 )
+
+# With more bars than this the numbers on them would overlap.
+_MOST_NUMBERED_BARS = 16
 
 
 @styled
@@ -77,9 +81,9 @@ def minima(
 
         minima(best)
     """
+    found = labelled(restructured, labels, "restructured", "starts")
     panel = grid_of_axes(1, 1, axes, size=(5.5, 3.4))[0, 0]
     dress(panel)
-    found = labelled(restructured, labels, "restructured", "starts")
     for index, (label, result) in enumerate(found.items()):
         costs = np.sort(np.asarray(result.match_costs, float))
         hits = int(result.hits)
@@ -114,8 +118,8 @@ def minima(
 
 @styled
 def fit_over_points(
-    table: Mapping[str, ArrayLike],
-    points: Sequence[Any] | ArrayLike | None = None,
+    table: Mapping[str, Values],
+    points: Values | None = None,
     *,
     output_names: Sequence[str] | None = None,
     measure: str = "BFT (%)",
@@ -158,19 +162,15 @@ def fit_over_points(
         panel.grid(False, axis="x")
         for index, (label, array) in enumerate(values.items()):
             offset = (index - (len(values) - 1) / 2.0) * bar
-            panel.bar(place + offset, array[:, k], 0.92 * bar, color=colour(index), label=label)
-        panel.set_ylabel(measure)
-        if ny > 1:
-            panel.set_title(f"output {outputs[k]}", loc="left")
+            bars = panel.bar(
+                place + offset, array[:, k], 0.92 * bar, color=colour(index), label=label
+            )
+            if count * len(values) <= _MOST_NUMBERED_BARS:
+                panel.bar_label(bars, fmt="%.1f", fontsize=7.5, padding=1)
+        panel.set_ylabel(f"{outputs[k]}: {measure}" if ny > 1 else measure)
     panels[-1].set_xticks(place, names, rotation=0 if max(map(len, names)) < 7 else 40)
     panels[-1].set_xlabel("operating point")
-    legend(
-        panels[0],
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        ncols=min(len(values), 4),
-        borderaxespad=0.1,
-    )
+    legend_above(panels[0])
     return panels
 
 

@@ -16,7 +16,7 @@ from lpvid.plot._figure import (
     dress,
     grid_of_axes,
     labelled,
-    legend,
+    legend_above,
     model_of,
     styled,
     with_unit,
@@ -44,21 +44,19 @@ def records(data: IOData, *, axes: Any = None) -> np.ndarray:
             (data.kappa, data.scheduling_names, data.scheduling_units, colour(2), "scheduling")
         )
     channels = [
-        (np.asarray(signal)[:, k], with_unit(names[k], units[k]), shade, kind)
+        (np.asarray(signal)[:, k], f"{kind} {names[k]}", units[k], shade)
         for signal, names, units, shade, kind in groups
         for k in range(len(names))
     ]
     count = len(channels)
-    panels = grid_of_axes(count, 1, axes, size=(7.5, 0.6 + 1.3 * count), sharex=True)[:, 0]
-    before = None
-    for panel, (signal, label, shade, kind) in zip(panels, channels, strict=True):
+    panels = grid_of_axes(count, 1, axes, size=(7.5, 0.6 + 1.4 * count), sharex=True)[:, 0]
+    for panel, (signal, title, unit, shade) in zip(panels, channels, strict=True):
         dress(panel)
         panel.margins(x=0.01)
         panel.plot(*_over_time(data, signal), color=shade, linewidth=1.0)
-        panel.set_ylabel(label)
-        if kind != before:
-            panel.set_title(f"{kind}s" if kind != "scheduling" else kind, loc="left")
-        before = kind
+        # Long names would run into their neighbours if they stood upright.
+        panel.set_title(title, loc="left")
+        panel.set_ylabel(unit)
         _separate_records(panel, data)
     panels[-1].set_xlabel("time (s)")
     return panels
@@ -119,19 +117,11 @@ def compare(
             text = f"{label}: BFT {scores[label][k]:.2f} %"
             main.plot(*_over_time(data, output[:, k]), label=text, **look)
             rest.plot(*_over_time(data, measured[:, k] - output[:, k]), label=label, **look)
-        main.set_title(f"output {data.output_names[k]}", loc="left")
         main.set_ylabel(with_unit(data.output_names[k], data.output_units[k]))
         rest.set_ylabel(with_unit("residual", data.output_units[k]))
         _separate_records(main, data)
         _separate_records(rest, data)
-        # Above the axes: inside, it would lie on the curves of a dense record.
-        legend(
-            main,
-            loc="lower right",
-            bbox_to_anchor=(1.0, 1.0),
-            ncols=min(len(outputs) + 1, 3),
-            borderaxespad=0.1,
-        )
+        legend_above(main)
     panels[-1, 1].set_xlabel("time (s)")
     return panels
 
@@ -139,11 +129,13 @@ def compare(
 def _simulated(data: IOData, model: Any, label: str) -> np.ndarray:
     model = model_of(model)
     if isinstance(model, LPVStateSpace):
-        if data.kappa is None:
-            raise ValueError(
-                f"data: the LPV model {label!r} needs the scheduling; build the data with kappa=."
-            )
-        parts = [model.simulate(u=r.u, kappa=r.kappa, dt=r.dt) for r in data.records]
+        parts = []
+        for record in data.records:
+            if record.kappa is None:
+                raise ValueError(
+                    f"data: the LPV model {label!r} needs the scheduling; give kappa= to IOData."
+                )
+            parts.append(model.simulate(u=record.u, kappa=record.kappa, dt=record.dt))
         output = np.concatenate([np.asarray(part) for part in parts])
     elif hasattr(model, "simulate"):
         parts = [model.simulate(u=r.u, dt=r.dt) for r in data.records]

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
-from lpvid._results import Solution, Status
+from lpvid._results import Status
 from lpvid.models import AbstractStructure, StateSpace, d2c
-from lpvid.restructure._matching import Target, make_target, match_from_starts
+from lpvid.restructure._matching import Target, error_norm, make_target, match_from_starts
 from lpvid.restructure._surrogate import refine_smooth
 
 # Two searches ended in the same minimum if their costs differ by less than this factor.
@@ -26,17 +26,17 @@ class HinfMatching(eqx.Module):
     - `match_steps`: Levenberg–Marquardt steps from each start.
     - `log2_powers`: exponents of the surrogate, round after round, as powers of two.
     - `descent_steps`: L-BFGS steps of each round.
-    - `n_peaks`: peaks of the difference that are added to the grid in each round.
+    - `passes`: how often the rounds are gone through, each time with the exact peak added.
     """
 
     frequencies: int = eqx.field(static=True, default=60)
     match_steps: int = eqx.field(static=True, default=80)
     log2_powers: tuple[int, ...] = eqx.field(static=True, default=(1, 3, 5, 7))
     descent_steps: int = eqx.field(static=True, default=60)
-    n_peaks: int = eqx.field(static=True, default=6)
+    passes: int = eqx.field(static=True, default=2)
 
     def __check_init__(self):
-        for name in ("frequencies", "match_steps", "descent_steps", "n_peaks"):
+        for name in ("frequencies", "match_steps", "descent_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: at least 1 is needed, got {getattr(self, name)}.")
 
@@ -51,7 +51,7 @@ class Restructured(eqx.Module):
     - `match_costs`: least-squares cost that each start ended with, sorted.
     - `hits`: how many starts ended in the best minimum; `margin`: cost of the next distinct
       minimum over the best one (infinite where there is none).
-    - `history`: norm at the start of the surrogate stage and after each of its rounds.
+    - `history`: norm before the surrogate stage and after each of its passes.
     """
 
     structure: AbstractStructure
@@ -61,7 +61,7 @@ class Restructured(eqx.Module):
     match_costs: Float[Array, "*batch start"]
     hits: Int[Array, "*batch"]
     margin: Float[Array, "*batch"]
-    history: Float[Array, "*batch round"]
+    history: Float[Array, "*batch pass"]
     status: Status
 
     @property
@@ -177,45 +177,60 @@ def restructure_along(
     return improved
 
 
-@eqx.filter_jit
 def _run(target, structure, search, scattered, given, method) -> Restructured:
-    candidates, costs = [], []
+    # Compiled piece by piece: each piece then serves every number and kind of starts, and the
+    # norm, dear to compile, is compiled once for all its callers.
+    candidates, costs = [], None
     if scattered is not None:
-        found = match_from_starts(search, scattered, target, method.match_steps)
-        costs.append(found.cost)
+        found = _match(search, scattered, target, method.match_steps)
+        costs = found.cost
         best = found.value[jnp.argmin(found.cost)]
         candidates.append(structure.from_search(best)[None])
     if given is not None:
         candidates.append(given)
-    polished: Solution = match_from_starts(
-        structure, jnp.concatenate(candidates), target, method.match_steps
-    )
-    costs.append(polished.cost)
-    winner = jnp.argmin(polished.cost)
-    descent = refine_smooth(
-        structure,
-        polished.value[winner],
-        target,
-        log2_powers=method.log2_powers,
-        steps=method.descent_steps,
-        n_peaks=method.n_peaks,
-    )
+    matched = _match(structure, jnp.concatenate(candidates), target, method.match_steps)
     # Hits are counted where the search was made: the polished point is one more trial.
-    searched = jnp.sort(costs[0])
-    same = searched <= _SAME_MINIMUM * searched[0] + 1e-16
-    others = jnp.where(same, jnp.inf, searched)
+    costs = jnp.sort(matched.cost if costs is None else costs)
+    parameters = matched.value[jnp.argmin(matched.cost)]
+    norm, peak = error_norm(structure, parameters, target)
+    history = [norm]
+    for _ in range(method.passes):
+        descent = _descend(structure, parameters, target, peak[None], method)
+        moved_norm, moved_peak = error_norm(structure, descent.value, target)
+        ahead = jnp.isfinite(moved_norm) & (moved_norm < norm)
+        parameters = jnp.where(ahead, descent.value, parameters)
+        # The peak is kept in any case: it is what the last grid lacked.
+        norm, peak = jnp.where(ahead, moved_norm, norm), moved_peak
+        history.append(norm)
+    norm, peak = error_norm(structure, parameters, target)
+    same = costs <= _SAME_MINIMUM * costs[0] + 1e-16
     return Restructured(
         structure=structure,
-        parameters=descent.value,
-        error_norm=descent.error_norm,
-        peak_frequency=descent.peak,
-        match_costs=searched,
+        parameters=parameters,
+        error_norm=norm,
+        peak_frequency=peak,
+        match_costs=costs,
         hits=jnp.sum(same),
-        margin=jnp.min(others) / jnp.maximum(searched[0], 1e-300),
-        history=descent.history,
-        status=Status.where(
-            jnp.isfinite(descent.error_norm), Status.successful, Status.nonfinite
-        ),
+        margin=jnp.min(jnp.where(same, jnp.inf, costs)) / jnp.maximum(costs[0], 1e-300),
+        history=jnp.stack(history),
+        status=Status.where(jnp.isfinite(norm), Status.successful, Status.nonfinite),
+    )
+
+
+@eqx.filter_jit
+def _match(structure, starts, target, max_steps):
+    return match_from_starts(structure, starts, target, max_steps)
+
+
+@eqx.filter_jit
+def _descend(structure, start, target, peaks, method):
+    return refine_smooth(
+        structure,
+        start,
+        target,
+        peaks,
+        log2_powers=method.log2_powers,
+        steps=method.descent_steps,
     )
 
 

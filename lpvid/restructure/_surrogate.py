@@ -6,17 +6,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lpvid._solve import Bounds, minimise
-from lpvid.analysis import peak_frequencies
 from lpvid.models import AbstractStructure
-from lpvid.restructure._matching import Target, error_norm, response_error
+from lpvid.restructure._matching import Target, response_error
+
+Peaks = Float[Array, " peak"]
 
 
 class SmoothDescent(eqx.Module):
-    """Result of the surrogate stage: the best parameters by the exact norm."""
+    """Result of the surrogate stage.
+
+    Attributes:
+        value: the best point seen.
+        history: largest gain of the difference on the grid at the start and after each round.
+    """
 
     value: Float[Array, " parameter"]
-    error_norm: Float[Array, ""]
-    peak: Float[Array, ""]
     history: Float[Array, " round"]
 
 
@@ -36,7 +40,7 @@ def power_norm(error: Array, log2_power: Array, most: int) -> Float[Array, ""]:
     for step in range(most):
         power = jnp.where(step < log2_power, power @ power, power)
     total = jnp.sum(jnp.real(jnp.trace(power, axis1=-2, axis2=-1)))
-    # total is in [1/m, m·n]; the floor only matters for a perfect match, where all is zero.
+    # The floor only matters for a perfect match, where all is zero.
     return scale * jnp.exp(jnp.log(jnp.maximum(total, 1e-300)) / 2.0**log2_power)
 
 
@@ -44,61 +48,60 @@ def refine_smooth(
     structure: AbstractStructure,
     start: Array,
     target: Target,
+    peaks: Peaks,
     *,
     log2_powers: tuple[int, ...],
     steps: int,
-    n_peaks: int,
 ) -> SmoothDescent:
     """Minimise ‖Σ(ϑ)‖∞ from `start`: L-BFGS on `power_norm`, round after round.
 
-    Every round refreshes the grid with the exact peaks of the current difference and raises the
-    exponent. The parameters are scaled by the inverse square root of the Gauss–Newton matrix
-    at the start, so that a step of one changes the response equally in all directions.
+    Every round raises the exponent and refreshes the grid, which holds the target's
+    frequencies, the current model's poles and `peaks` (with near neighbours of both). The
+    parameters are scaled by the inverse square root of the Gauss–Newton matrix at the start, so
+    that a step of one changes the response equally in all directions.
     """
     bounds = Bounds(*structure.bounds())
-
     free = bounds.free(start)
     shape = _scaling(structure, bounds, free, target)
-    first_norm, first_peak = error_norm(structure, start, target)
 
-    def one_round(best_state, log2_power):
-        point, best_norm, _ = best_state
-        fine = _with_peaks(structure, bounds.bounded(point), target, n_peaks)
-        reference = power_norm(
-            response_error(structure, bounds.bounded(point), fine), log2_power, max(log2_powers)
-        )
+    def one_round(state, log2_power):
+        best, best_norm = state
+        fine = _refined(structure, bounds.bounded(best), target, peaks)
+        before = response_error(structure, bounds.bounded(best), fine)
+        current = power_norm(before, log2_power, max(log2_powers)) + jnp.finfo(float).tiny
 
         def loss(step):
-            error = response_error(structure, bounds.bounded(point + shape @ step), fine)
-            norm = power_norm(error, log2_power, max(log2_powers))
-            return norm / (reference + jnp.finfo(float).tiny)
+            error = response_error(structure, bounds.bounded(best + shape @ step), fine)
+            return power_norm(error, log2_power, max(log2_powers)) / current
 
-        found = minimise(loss, jnp.zeros_like(point), max_steps=steps)
-        moved = point + shape @ found.value
-        norm, peak = error_norm(structure, bounds.bounded(moved), target)
+        found = minimise(loss, jnp.zeros_like(best), max_steps=steps)
+        moved = best + shape @ found.value
+        after = _refined(structure, bounds.bounded(moved), target, peaks)
+        norm = largest_gain(response_error(structure, bounds.bounded(moved), after))
         ahead = jnp.isfinite(norm) & (norm < best_norm)
-        state = (moved, norm, peak)
-        return jax.tree.map(lambda new, old: jnp.where(ahead, new, old), state, best_state), norm
+        return (jnp.where(ahead, moved, best), jnp.where(ahead, norm, best_norm)), norm
 
+    fine = _refined(structure, start, target, peaks)
+    first = largest_gain(response_error(structure, start, fine))
     rounds = jnp.asarray(log2_powers, float)
-    (best, best_norm, peak), history = jax.lax.scan(
-        one_round, (free, first_norm, first_peak), rounds
-    )
-    return SmoothDescent(
-        value=bounds.bounded(best),
-        error_norm=best_norm,
-        peak=peak,
-        history=jnp.concatenate([first_norm[None], history]),
-    )
+    (best, _), history = jax.lax.scan(one_round, (free, first), rounds)
+    return SmoothDescent(bounds.bounded(best), jnp.concatenate([first[None], history]))
 
 
-def _with_peaks(structure, parameters, target: Target, n_peaks: int) -> Target:
-    """The target on a grid with the current difference's peaks and their near neighbours."""
+def largest_gain(error: Array) -> Float[Array, ""]:
+    """Largest singular value over all frequencies of the grid."""
+    return jnp.max(jnp.linalg.svd(error, compute_uv=False))
+
+
+def _refined(structure, parameters, target: Target, peaks: Peaks) -> Target:
+    """The target on a grid with the peaks and the structured model's own resonances."""
     if target.black_box is None:
         return target
-    omega, _ = peak_frequencies(structure.matrices(parameters) - target.black_box, n_peaks)
-    extra = jnp.concatenate([omega, 0.9 * omega, 1.1 * omega])
-    grid = jnp.concatenate([target.omega, jnp.where(jnp.isfinite(extra), extra, 0.0)])
+    # Its poles move the grid, not the loss: no derivative is wanted (or exists at double poles).
+    poles = jax.lax.stop_gradient(structure.matrices(parameters)).poles()
+    extra = jnp.concatenate([jnp.abs(jnp.imag(poles)), peaks])
+    extra = jnp.where(jnp.isfinite(extra), extra, 0.0)
+    grid = jnp.concatenate([target.omega, 0.9 * extra, 0.97 * extra, extra, 1.03 * extra, 1.1 * extra])
     return Target(grid, target.black_box.frequency_response(grid), target.black_box)
 
 
@@ -116,5 +119,5 @@ def _scaling(structure, bounds, free, target) -> Float[Array, "parameter paramet
     floor = 1e-8 * jnp.max(values)
     inverse = vectors / jnp.sqrt(jnp.maximum(values, floor))[None]
     # Steps of about the size of the error that is left.
-    left = jnp.sqrt(jnp.mean(residual(free) ** 2) * residual(free).size)
+    left = jnp.linalg.norm(residual(free))
     return (inverse / size[:, None]) * jnp.maximum(left, 1e-300)

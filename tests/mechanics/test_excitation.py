@@ -14,10 +14,10 @@ KEY = jax.random.key(3)
 
 @given(
     seed=st.integers(0, 1000),
-    samples=st.sampled_from([40, 41, 47]),
-    hold=st.sampled_from([1, 4, 7]),
+    samples=st.sampled_from([41, 47]),
+    hold=st.sampled_from([1, 7]),
 )
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_prbs_has_two_levels_held_and_balanced(seed, samples, hold):
     signal = np.asarray(prbs(jax.random.key(seed), samples, 2, amplitude=0.3, hold=hold))
     assert signal.shape == (samples, 2)

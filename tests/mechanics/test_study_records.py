@@ -48,7 +48,8 @@ def test_the_batch_equals_its_parts(study):
 
 
 def test_local_records_follow_the_local_linear_models(study):
-    for theta2, record in zip(OPERATING_POINTS, study.validation.records, strict=True):
+    records = study.validation.records
+    for theta2, record in list(zip(OPERATING_POINTS, records, strict=True))[::3]:
         model = ARM.linearised(theta2)
         system = control.ss(*(np.asarray(m) for m in (model.A, model.B, model.C, model.D)))
         sampled = system.sample(record.dt)
@@ -59,8 +60,8 @@ def test_local_records_follow_the_local_linear_models(study):
 
 
 def test_validation_record_is_one_point():
-    record = validation_record(ARM, KEY, theta2=1.0, n_samples=1000)
-    assert record.lengths == (100,)
+    record = validation_record(ARM, KEY, theta2=1.0, n_samples=4000)
+    assert record.lengths == (400,)
     np.testing.assert_allclose(record.kappa, np.cos(1.0))
 
 

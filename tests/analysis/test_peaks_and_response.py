@@ -1,0 +1,60 @@
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from analysis_systems import modal_system, sampled
+
+from lpvid.analysis import hinf_norm, peak_frequencies, singular_values
+from lpvid.models import StateSpace
+
+peaks = eqx.filter_jit(peak_frequencies)
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.01])
+def test_peaks_are_the_local_maxima_of_a_dense_grid(dt):
+    A, B, C, D = modal_system(np.random.default_rng(1), 8, 2, 2, damping=3e-3, feedthrough=0.1)
+    if dt:
+        A, B, C, D = sampled(A, B, C, D, dt)
+    system = StateSpace(A, B, C, D, dt=dt)
+    grid = np.linspace(0.0, np.pi / dt if dt else 200.0, 400_001)
+    gain = np.asarray(singular_values(system, grid))[:, 0]
+    inner = np.flatnonzero((gain[1:-1] > gain[:-2]) & (gain[1:-1] > gain[2:])) + 1
+    omega, height = peaks(system, 12)
+    for index in inner:
+        nearest = np.argmin(np.abs(omega - grid[index]))
+        np.testing.assert_allclose(omega[nearest], grid[index], atol=2 * grid[1])
+        assert height[nearest] >= gain[index] * (1 - 1e-12)
+    assert np.all(np.diff(height) <= 0.0) or np.sum(np.diff(height) > 0.0) == 1
+    norm = hinf_norm(system)
+    if np.isfinite(norm.frequency):
+        np.testing.assert_allclose(height[0], norm.value, rtol=1e-9)
+
+
+def test_padding_repeats_the_highest():
+    system = StateSpace([[-1.0]], [[1.0]], [[2.0]])
+    omega, gain = peaks(system, 5)
+    assert omega.shape == gain.shape == (5,)
+    np.testing.assert_allclose(gain[0], 2.0)
+    assert np.all(np.isin(np.asarray(gain), np.asarray(gain[:2])))
+    batch = jax.vmap(lambda a: peak_frequencies(StateSpace(a, [[1.0]], [[2.0]]), 2)[1])
+    np.testing.assert_allclose(batch(np.array([[[-1.0]], [[-2.0]]]))[:, 0], [2.0, 1.0])
+    with pytest.raises(ValueError, match="count"):
+        peak_frequencies(system, 0)
+
+
+def test_defective_systems_have_peaks_too():
+    A = -np.eye(4) + np.diag(np.ones(3), 1)
+    system = StateSpace(A, np.ones((4, 1)), np.ones((1, 4)))
+    omega, gain = peaks(system, 3)
+    np.testing.assert_allclose(gain[0], hinf_norm(system).value, rtol=1e-10)
+    assert np.all(np.isfinite(omega))
+
+
+def test_singular_values():
+    A, B, C, D = modal_system(np.random.default_rng(2), 4, 2, 3)
+    omega = np.array([0.0, 1.0, 30.0])
+    states = np.linalg.solve(1j * omega[:, None, None] * np.eye(4) - A, B[None])
+    expected = np.linalg.svd(C @ states + D, compute_uv=False)
+    np.testing.assert_allclose(singular_values(StateSpace(A, B, C, D), omega), expected, rtol=1e-9)
+    with pytest.raises(ValueError, match="omega"):
+        singular_values(StateSpace(A, B, C, D), omega[None])
