@@ -37,7 +37,9 @@ class Bounds(eqx.Module):
     def free(self, bounded: Parameters) -> Parameters:
         """Unbounded coordinates of a point, which is first moved just inside the bounds."""
         low, high, has_low, has_high = self._finite()
-        margin = 1e-8 * jnp.where(has_low & has_high, high - low, jnp.maximum(jnp.abs(bounded), 1.0))
+        margin = 1e-8 * jnp.where(
+            has_low & has_high, high - low, jnp.maximum(jnp.abs(bounded), 1.0)
+        )
         inside = jnp.where(has_low, jnp.maximum(bounded, low + margin), bounded)
         inside = jnp.where(has_high, jnp.minimum(inside, high - margin), inside)
         share = jnp.where(has_low & has_high, (inside - low) / (high - low), 0.5)
@@ -66,9 +68,7 @@ class Bounds(eqx.Module):
 
 
 def _status(result, cost) -> Status:
-    ended = Status.where(
-        result == optx.RESULTS.successful, Status.successful, Status.max_steps
-    )
+    ended = Status.where(result == optx.RESULTS.successful, Status.successful, Status.max_steps)
     return Status.where(jnp.isfinite(cost), ended, Status.nonfinite)
 
 

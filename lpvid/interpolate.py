@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from lpvid.models import (
@@ -113,7 +114,7 @@ def leave_one_out(
 def interpolate_balanced(
     models: Sequence[StateSpace], kappas: ArrayLike, method: Polynomial | None = None
 ) -> LPVStateSpace:
-    """The naive way: balance each black box, fix signs, interpolate entry by entry.
+    """The naive way: balance each black box, match signs along κ, interpolate entry by entry.
 
     For comparison with 001 only. Balanced bases of neighbouring models need not be coherent
     (nearly equal Hankel singular values rotate them), so that the result may be far off between
@@ -123,7 +124,23 @@ def interpolate_balanced(
 
         naive = interpolate_balanced(black_boxes, kappas, Polynomial(degree=2))
     """
-    return interpolate([balance(model)[0] for model in models], kappas, method)
+    balanced = [balance(model)[0] for model in models]
+    for index in range(1, len(balanced)):
+        balanced[index] = _same_signs(balanced[index], balanced[index - 1])
+    return interpolate(balanced, kappas, method)
+
+
+def _same_signs(model: StateSpace, neighbour: StateSpace) -> StateSpace:
+    """Flip the states of a balanced model whose input and output rows point the other way."""
+    agreement = jnp.sum(model.B * neighbour.B, axis=1) + jnp.sum(model.C * neighbour.C, axis=0)
+    signs = jnp.where(agreement < 0, -1.0, 1.0)
+    return StateSpace(
+        signs[:, None] * model.A * signs[None],
+        signs[:, None] * model.B,
+        model.C * signs[None],
+        model.D,
+        model.dt,
+    )
 
 
 def _points(kappas: ArrayLike, count: int) -> Points:
@@ -177,7 +194,7 @@ def _local_parameters(models) -> tuple[AbstractStructure, Float[Array, "point pa
             )
         structure = FreeStructure(first.nx, first.nu, first.ny)
         parameters = jnp.stack([structure.parameters_of(m) for m in models])
-    if not isinstance(parameters, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(parameters))):
+    if not isinstance(parameters, Tracer) and not bool(jnp.all(jnp.isfinite(parameters))):
         bad = [i for i in range(len(models)) if not bool(jnp.all(jnp.isfinite(parameters[i])))]
         raise ValueError(f"models: non-finite parameters at point(s) {bad}; leave them out.")
     return structure, parameters
@@ -198,6 +215,3 @@ def interpolation_fit(lpv: LPVStateSpace, models, kappas: ArrayLike) -> Float[Ar
     fitted = jnp.concatenate([frozen.A.reshape(count, -1), frozen.B.reshape(count, -1)], axis=1)
     error = jnp.linalg.norm(local - fitted)
     return 100.0 * (1.0 - error / jnp.linalg.norm(local - jnp.mean(local)))
-
-
-__all__ = ["interpolate", "interpolate_balanced", "interpolation_fit", "leave_one_out"]

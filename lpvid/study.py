@@ -157,7 +157,9 @@ def run_study(
     }
     fits = {
         name: {
-            d: float(interpolation_fit(_interpolate(name, local[name], kappas, d), local[name], kappas))
+            d: float(
+                interpolation_fit(_interpolate(name, local[name], kappas, d), local[name], kappas)
+            )
             for d in (1, 2)
         }
         for name in MODEL_NAMES
@@ -245,7 +247,9 @@ def _identify_all(local: IOData, key: PRNGKeyArray, runs: int):
     first = points[0].replace(kappa=None)
     models, status, noisy = _identify_batch(first, u, y, keys)
     succeeded = np.asarray(status == Status.successful)
-    finite = np.all([np.isfinite(leaf).all(axis=(-1, -2)) for leaf in jax.tree.leaves(models)], axis=0)
+    finite = np.all(
+        [np.isfinite(leaf).all(axis=(-1, -2)) for leaf in jax.tree.leaves(models)], axis=0
+    )
     example = local.replace(y=noisy[:, 0].reshape(-1, local.ny))
     return models, succeeded & finite, example
 

@@ -22,10 +22,11 @@ from lpvid.identify._checks import (
     resolve_block_rows,
 )
 from lpvid.identify._factor import ILL_CONDITIONED, Route, data_factor
+from lpvid.identify._linear_fit import solve
 from lpvid.identify._methods import AbstractSubspaceMethod, PastOutputMOESP
 from lpvid.identify._order import choose_order
 from lpvid.identify._realise import left_range, move_inside, realise, spectral_radius
-from lpvid.identify._simulation_error import record_equations, solve
+from lpvid.identify._simulation_error import record_equations
 from lpvid.models import StateSpace
 
 # Growth of an unstable model over one window that B and D are estimated from.
@@ -205,6 +206,7 @@ def _complete(found, u, y, *, method, order, windows):
         A, moved = move_inside(A, method.stabilise)
     linear = solve(
         record_equations(A, C, u / scale[None, :nu], y / scale[None, nu:], windows),
+        nx=order,
         feedthrough=method.feedthrough,
     )
     B = linear.B / scale[None, :nu]

@@ -6,21 +6,23 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lpvid.data import IOData
-from lpvid.identify._simulation_error import record_equations, solve_positive
+from lpvid.identify._linear_fit import solve_positive
+from lpvid.identify._simulation_error import record_equations
 from lpvid.models import StateSpace
 
 
 @jax.jit
 def _least_squares_start(A, B, C, D, equations):
-    nu, nx = B.shape[1], A.shape[0]
-    b = nu * nx
+    (nx, nu), ny = B.shape, C.shape[0]
+    known = jnp.concatenate([jnp.broadcast_to(B.T[None], (ny, nu, nx)), D[:, :, None]], axis=2)
+    known = known.reshape(ny, nu * (nx + 1))
+    start = slice(nu * (nx + 1), -1)
 
     def one(equation):
-        known = B.T.reshape(b)
-        right = jnp.sum(equation.states_outputs[:, b:], axis=0)
-        right -= jnp.sum(equation.states[:, b:, :b], axis=0) @ known
-        right -= jnp.einsum("kaj,kj->a", equation.states_inputs[:, b:], D)
-        return solve_positive(jnp.sum(equation.states[:, b:, b:], axis=0), right[:, None])[:, 0]
+        rest = equation.right[:, start]
+        rest -= jnp.einsum("kab,kb->ka", equation.matrix[:, start, : known.shape[1]], known)
+        square = jnp.sum(equation.matrix[:, start, start], axis=0)
+        return solve_positive(square, jnp.sum(rest, axis=0)[:, None])[:, 0]
 
     return jax.lax.map(one, equations)
 

@@ -1,9 +1,9 @@
-r"""B, D and x0 from the simulation error, linear in all three once A and C are known.
+r"""Normal equations of B, D and x0 in the simulation error, without the regressors.
 
-$y_k(t) = C_k A^t x_0 + \sum_j r_{kj}(t) B_j + \sum_j D_{kj} u_j(t)$ with the regressors filtered,
-$r_{kj}(t+1) = r_{kj}(t) A + C_k u_j(t)$. They are never formed: within a block of L samples they
-are linear in the block's inputs and in the regressors at its start, so the normal equations follow
-from the Gram matrix of those over all blocks, contracted with fixed matrices.
+With A and C known, $y_k(t) = C_k A^t x_0 + \sum_j r_{kj}(t) B_j + \sum_j D_{kj} u_j(t)$ is linear
+in the rest, the regressors filtered: $r_{kj}(t+1) = r_{kj}(t) A + C_k u_j(t)$. They are never
+formed: within a block of L samples they are linear in its inputs and in the regressors at its start, so the normal equations follow from the Gram matrix of those over all blocks, contracted with
+matrices that A and C alone fix. x0 is one more input channel, an impulse before the record.
 """
 
 import math
@@ -12,7 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
 # Blocks whose Gram matrix is summed before the next are looked at: memory is flat in N.
@@ -22,75 +21,20 @@ _RADIX = 8
 
 
 class NormalEquations(eqx.Module):
-    """Normal equations of one record, for each output k; x0 counts as one more input channel.
+    """Normal equations for each output k, in the entries (channel, coefficient).
+
+    Channels are the inputs, then x0. Coefficients are the nx entries of a column of B (or of x0),
+    then D_kj (nothing for x0).
 
     Attributes:
-        states: between the columns of B, then x0: `(ny, (nu+1) nx, (nu+1) nx)`.
-        states_inputs: between those and the row of D, `(ny, (nu+1) nx, nu)`.
-        inputs: between the entries of a row of D, `(nu, nu)`.
-        states_outputs: right-hand side for B and x0, `(ny, (nu+1) nx)`.
-        inputs_outputs: right-hand side for D, `(ny, nu)`.
-        outputs: sum of squares, `(ny,)`.
+        matrix: `(ny, (nu+1) (nx+1), (nu+1) (nx+1))`.
+        right: `(ny, (nu+1) (nx+1))`.
+        power: sum of squares of the outputs, `(ny,)`.
     """
 
-    states: Float[Array, "*record ny q q"]
-    states_inputs: Float[Array, "*record ny q nu"]
-    inputs: Float[Array, "*record nu nu"]
-    states_outputs: Float[Array, "*record ny q"]
-    inputs_outputs: Float[Array, "*record ny nu"]
-    outputs: Float[Array, "*record ny"]
-
-
-class _Lifted(eqx.Module):
-    """What a block of L samples does to the regressors: fixed by A and C."""
-
-    power: Float[Array, "nx nx"]  # A^L
-    advance: Float[Array, "L ny nx"]  # input sample to the regressors at the block's end
-    within: Float[Array, "ny L p nx"]  # [inputs of the block, start] to the regressors in it
-
-
-def _lift(A: Array, C: Array, size: int) -> _Lifted:
-    nx = A.shape[0]
-    powers = jnp.eye(nx)[None]
-    ahead = A
-    while powers.shape[0] < size:
-        powers = jnp.concatenate([powers, powers @ ahead])
-        ahead = ahead @ ahead
-    powers = powers[:size]
-    impulse = jnp.einsum("kx,txa->tka", C, powers)
-    t, i = np.arange(size)[:, None], np.arange(size)[None, :]
-    delayed = jnp.concatenate([impulse, jnp.zeros_like(impulse[:1])])[
-        np.where(i < t, t - 1 - i, size)
-    ]
-    start = jnp.broadcast_to(powers[None], (C.shape[0], size, nx, nx))
-    return _Lifted(
-        power=powers[-1] @ A,
-        advance=impulse[::-1],
-        within=jnp.concatenate([delayed.transpose(2, 0, 1, 3), start], axis=2),
-    )
-
-
-def _prefix(increments: Array, power: Array) -> Array:
-    """States s_b = Σ_{m ≤ b} e_m F^{b−m} for `(lane, block, nx)` increments e and F = `power`."""
-    lanes, blocks, nx = increments.shape
-    if blocks <= 1:
-        return increments
-    groups = -(-blocks // _RADIX)
-    padded = jnp.pad(increments, ((0, 0), (0, groups * _RADIX - blocks), (0, 0)))
-    powers = [jnp.eye(nx)]
-    for _ in range(_RADIX):
-        powers.append(powers[-1] @ power)
-    zero = jnp.zeros((nx, nx))
-    lower = [[powers[j - i] if j >= i else zero for j in range(_RADIX)] for i in range(_RADIX)]
-    local = (padded.reshape(lanes * groups, _RADIX * nx) @ jnp.block(lower)).reshape(
-        lanes, groups, _RADIX, nx
-    )
-    # What the groups before hand over, by the same rule one level up.
-    ends = _prefix(local[:, :, -1], powers[-1])
-    handed = jnp.pad(ends[:, :-1], ((0, 0), (1, 0), (0, 0)))
-    carried = handed.reshape(lanes * groups, nx) @ jnp.concatenate(powers[1:], axis=1)
-    total = local + carried.reshape(lanes, groups, _RADIX, nx)
-    return total.reshape(lanes, groups * _RADIX, nx)[:, :blocks]
+    matrix: Float[Array, "*record ny entry entry"]
+    right: Float[Array, "*record ny entry"]
+    power: Float[Array, "*record ny"]
 
 
 def block_size(nx: int, nu: int, ny: int) -> int:
@@ -105,104 +49,62 @@ def normal_equations(
     u: Float[Array, "time nu"],
     y: Float[Array, "time ny"],
 ) -> NormalEquations:
-    """Normal equations of one record for B, D and x0. Memory is flat in the record's length."""
-    time, nu = u.shape
-    ny, nx = C.shape
+    """Normal equations of one record. Memory is flat in the record's length."""
+    (time, nu), (ny, nx) = u.shape, C.shape
     size = min(block_size(nx, nu, ny), time)
-    lifted = _lift(A, C, size)
-    n_blocks = time // size
+    n_blocks = -(-time // size)
     at_once = min(_BLOCKS_AT_ONCE, n_blocks)
+    n_chunks, leftover = divmod(n_blocks, at_once)
+    surplus = n_blocks * size - time
+    padded = [jnp.pad(signal, ((0, surplus), (0, 0))) for signal in (u, y)]
+
+    powers = _powers(A, size + 1)
+    impulse = jnp.einsum("kx,txa->tka", C, powers[:size])
+    # What an input sample adds to the regressors at the block's end.
+    advance = impulse[::-1].reshape(size, ny * nx)
+    jumps = _powers(powers[size], _RADIX + 1)
 
     def piece(states, first, count):
-        """Gram matrix over `count` blocks from sample `first`, and the states after them."""
-        ub = jax.lax.dynamic_slice_in_dim(u, first, count * size).reshape(count, size, nu)
-        yb = jax.lax.dynamic_slice_in_dim(y, first, count * size).reshape(count, size * ny)
-        advance = lifted.advance.reshape(size, ny * nx)
-        e = (ub.transpose(2, 0, 1).reshape(nu * count, size) @ advance).reshape(nu, count, ny, nx)
-        e = jnp.pad(e.transpose(0, 2, 1, 3), ((0, 1), (0, 0), (0, 0), (0, 0)))
-        e = jnp.concatenate([states[:, None], e.reshape((nu + 1) * ny, count, nx)], axis=1)
-        s = _prefix(e, lifted.power)
+        """Gram matrix over `count` blocks from sample `first`, the states in the last and after."""
+        ub, yb = (
+            jax.lax.dynamic_slice_in_dim(signal, first, count * size).reshape(count, size, -1)
+            for signal in padded
+        )
+        ub = ub.transpose(0, 2, 1)
+        e = ub.transpose(1, 0, 2).reshape(nu * count, size) @ advance
+        e = e.reshape(nu, count, ny, nx).transpose(0, 2, 1, 3).reshape(nu * ny, count, nx)
+        e = jnp.pad(e, ((0, ny), (1, 0), (0, 0))).at[:, 0].set(states)
+        s = _prefix(e, jumps)
         begin = s[:, :-1].transpose(1, 0, 2).reshape(count, (nu + 1) * ny * nx)
-        # Inputs by channel, as the contraction below wants them.
-        left = jnp.concatenate([ub.transpose(0, 2, 1).reshape(count, nu * size), begin], axis=1)
-        return left.T @ jnp.concatenate([left, yb], axis=1), s[:, -1]
+        left = jnp.concatenate([ub.reshape(count, nu * size), begin], axis=1)
+        right = jnp.concatenate([left, yb.reshape(count, size * ny)], axis=1)
+        return left.T @ right, left[-1], s[:, -1]
 
-    states = jnp.concatenate([jnp.zeros((nu * ny, nx)), C])
-    gram, states = piece(states, 0, at_once)
-    n_chunks, leftover = divmod(n_blocks, at_once)
+    start = jnp.concatenate([jnp.zeros((nu * ny, nx)), C])
+    gram, last, states = piece(start, 0, at_once)
     if n_chunks > 1:
 
         def body(k, carry):
-            more, states = piece(carry[1], k * at_once * size, at_once)
-            return carry[0] + more, states
+            more, last, states = piece(carry[2], k * at_once * size, at_once)
+            return carry[0] + more, last, states
 
-        gram, states = jax.lax.fori_loop(1, n_chunks, body, (gram, states))
+        gram, last, states = jax.lax.fori_loop(1, n_chunks, body, (gram, last, states))
     if leftover:
-        more, states = piece(states, n_chunks * at_once * size, leftover)
+        more, last, states = piece(states, n_chunks * at_once * size, leftover)
         gram = gram + more
-    power = jnp.sum(y * y, axis=0)
-    whole = _contract(lifted.within, gram, nu, power)
-    rest = time - n_blocks * size
-    if rest == 0:
-        return whole
-    ut, yt = u[n_blocks * size :], y[n_blocks * size :]
-    padded = jnp.pad(ut.T, ((0, 0), (0, size - rest))).reshape(nu * size)
-    left = jnp.concatenate([padded, states.reshape((nu + 1) * ny * nx)])
-    right = jnp.concatenate([left, jnp.pad(yt, ((0, size - rest), (0, 0))).reshape(size * ny)])
-    last = left[:, None] * right[None, :]
-    tail = _contract(lifted.within[:, :rest], last, nu, jnp.zeros_like(power))
-    return jax.tree.map(jnp.add, whole, tail)
+    del states
 
-
-def _contract(within: Array, gram: Array, nu: int, power: Array) -> NormalEquations:
-    """Normal equations from the Gram matrix of [inputs, states] against [inputs, states, y]."""
-    # Fewer steps than the block has samples: a record's end, padded to a block.
-    ny, steps, p, nx = within.shape
-    size = p - nx
-    n_u, n_s = nu * size, (nu + 1) * ny * nx
-
-    def per_output(block):
-        """`(rows of [u, s], ...)` to `(ny, nu+1, p, ...)`; x0 has no inputs of its own."""
-        shape = block.shape[1:]
-        inputs = block[:n_u].reshape(nu, size, *shape)
-        inputs = jnp.concatenate([inputs, jnp.zeros((1, size, *shape))])
-        inputs = jnp.broadcast_to(inputs[None], (ny, *inputs.shape))
-        starts = jnp.moveaxis(block[n_u:].reshape(nu + 1, ny, nx, *shape), 1, 0)
-        return jnp.concatenate([inputs, starts], axis=2)
-
-    square = per_output(gram[:, : n_u + n_s])  # ny, j, p, columns
-    # The same for the columns, output by output.
-    square = jnp.stack(
-        [per_output(square[k].reshape(-1, n_u + n_s).T)[k] for k in range(ny)]
-    ).reshape(ny, (nu + 1) * p, nu + 1, p)  # k, (J, P), j, p (symmetric)
-    flat = within.transpose(0, 2, 1, 3).reshape(ny, p, steps * nx)
-    once = jnp.einsum("kqjp,kpz->kqjz", square, flat)
-    once = once.reshape(ny, nu + 1, p, nu + 1, steps, nx).transpose(0, 1, 3, 5, 4, 2)
-    states = jnp.einsum(
-        "kqz,kzb->kqb",
-        once.reshape(ny, (nu + 1) * (nu + 1) * nx, steps * p),
-        within.reshape(ny, steps * p, nx),
-    ).reshape(ny, nu + 1, nu + 1, nx, nx)  # J, j, a (of j), b (of J)
-    q = (nu + 1) * nx
-    states = states.transpose(0, 2, 3, 1, 4).reshape(ny, q, q)
-
-    columns = gram[:, :n_u].reshape(-1, nu, size)[:, :, :steps]
-    with_inputs = per_output(columns)  # ny, j, p, J, t
-    states_inputs = jnp.einsum("ktpa,kjpJt->kjaJ", within, with_inputs).reshape(ny, q, nu)
-    with_outputs = per_output(gram[:, n_u + n_s :].reshape(-1, size, ny)[:, :steps])
-    states_outputs = jnp.einsum("ktpa,kjptk->kja", within, with_outputs).reshape(ny, q)
-    among = gram[:n_u, :n_u].reshape(nu, size, nu, size)
-    inputs = jnp.einsum("jtJt->jJ", among[:, :steps, :, :steps])
-    across = gram[:n_u, n_u + n_s :].reshape(nu, size, size, ny)
-    inputs_outputs = jnp.einsum("jttk->kj", across[:, :steps, :steps])
-    return NormalEquations(
-        states=states,
-        states_inputs=states_inputs,
-        inputs=inputs,
-        states_outputs=states_outputs,
-        inputs_outputs=inputs_outputs,
-        outputs=power,
-    )
+    within = _within(impulse, powers[:size])
+    matrix, right = _contract(within, gram, nu)
+    if surplus:
+        # In the samples that fill up the last block, u and y are zero but the regressors ring on.
+        rows = _rows(nu, ny, nx, size)
+        entries = jnp.concatenate([last, jnp.zeros(1)])[rows].reshape(ny, nu + 1, size + nx)
+        end = jnp.einsum("kjp,kpa->kja", entries, within[:, size - surplus, :, :nx])
+        ringing = jnp.einsum("kjx,txa->tkja", end, powers[:surplus])
+        ringing = jnp.pad(ringing, ((0, 0), (0, 0), (0, 0), (0, 1))).reshape(surplus, ny, -1)
+        matrix = matrix - jnp.einsum("tka,tkb->kab", ringing, ringing)
+    return NormalEquations(matrix=matrix, right=right, power=jnp.sum(y * y, axis=0))
 
 
 def record_equations(
@@ -213,114 +115,103 @@ def record_equations(
     lengths: tuple[int, ...],
 ) -> NormalEquations:
     """Normal equations of every record, stacked along a leading axis."""
+    if len(lengths) == 1:
+        return jax.tree.map(lambda x: x[None], normal_equations(A, C, u, y))
     starts = np.cumsum([0, *lengths])
-    pieces: list = [None] * len(lengths)
+    groups, order = [], []
     for length in dict.fromkeys(lengths):
         members = [r for r, n in enumerate(lengths) if n == length]
-        us = jnp.stack([u[starts[r] : starts[r] + length] for r in members])
-        ys = jnp.stack([y[starts[r] : starts[r] + length] for r in members])
-        if len(members) == 1:
-            group = jax.tree.map(lambda x: x[None], normal_equations(A, C, us[0], ys[0]))
-        else:
-            group = jax.lax.map(lambda uy: normal_equations(A, C, *uy), (us, ys))
-        for position, r in enumerate(members):
-            pieces[r] = (group, position)
-    if len(set(lengths)) == 1:
-        return pieces[0][0]
-    chosen = [jax.tree.map(lambda x, i=i: x[i], group) for group, i in pieces]
-    return jax.tree.map(lambda *x: jnp.stack(x), *chosen)
+        pairs = tuple(
+            jnp.stack([signal[starts[r] : starts[r] + length] for r in members])
+            for signal in (u, y)
+        )
+        groups.append(jax.lax.map(lambda pair: normal_equations(A, C, *pair), pairs))
+        order += members
+    place = np.argsort(order)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[place], *groups)
 
 
-class LinearFit(eqx.Module):
-    """B, D, x0 of every record, and the residual's sum of squares for each output."""
-
-    B: Float[Array, "nx nu"]
-    D: Float[Array, "ny nu"]
-    x0: Float[Array, "record nx"]
-    residual: Float[Array, " ny"]
+def _powers(matrix: Array, count: int) -> Array:
+    """Powers 0 … `count` − 1; a loop, since compiling costs more than the products."""
+    nx = matrix.shape[0]
+    return jax.lax.scan(lambda p, _: (p @ matrix, p), jnp.eye(nx), length=count)[1]
 
 
-def solve(equations: NormalEquations, *, feedthrough: bool) -> LinearFit:
-    """Least squares for B and D, one x0 for each record."""
-    records, ny, q, _ = equations.states.shape
-    nu = equations.inputs.shape[-1]
-    nx = q // (nu + 1)
-    b = nu * nx
-    # Unknowns [B, x0] of all outputs, then the rows of D; x0 of each record is eliminated first.
-    pooled = jnp.sum(equations.states, axis=1)
-    right = jnp.sum(equations.states_outputs, axis=1)
-    n_d = ny * nu if feedthrough else 0
-    shared = equations.states_inputs.transpose(0, 2, 1, 3).reshape(records, q, ny * nu)[..., :n_d]
-    diagonal = jnp.kron(jnp.eye(ny), jnp.sum(equations.inputs, axis=0))[:n_d, :n_d]
-    top = jnp.sum(pooled[:, :b, :b], axis=0)
-    side = jnp.sum(shared[:, :b], axis=0)
-    known = jnp.concatenate([side.T, diagonal], axis=1)
-    normal = jnp.concatenate([jnp.concatenate([top, side], axis=1), known])
-    rhs = jnp.concatenate(
-        [
-            jnp.sum(right[:, :b], axis=0),
-            jnp.sum(equations.inputs_outputs, axis=0).reshape(ny * nu)[:n_d],
-        ]
-    )
-    coupling = jnp.concatenate([pooled[:, b:, :b], shared[:, b:]], axis=2)
+def _within(impulse: Array, powers: Array) -> Array:
+    """From [inputs of the block, regressors at its start] to [regressors, input] at each sample.
 
-    def eliminate(one):
-        block, cross, value = one
-        return solve_positive(block, jnp.concatenate([cross, value[:, None]], axis=1))
-
-    parts = (pooled[:, b:, b:], coupling, right[:, b:])
-    if records == 1:
-        solved = eliminate(jax.tree.map(lambda x: x[0], parts))[None]
-    else:
-        solved = jax.lax.map(eliminate, parts)
-    normal = normal - jnp.einsum("rxa,rxb->ab", coupling, solved[..., :-1])
-    rhs = rhs - jnp.einsum("rxa,rx->a", coupling, solved[..., -1])
-    theta = solve_positive(normal, rhs[:, None])[:, 0]
-    x0 = solved[..., -1] - jnp.einsum("rxa,a->rx", solved[..., :-1], theta)
-    D = theta[b:].reshape(ny, nu) if feedthrough else jnp.zeros((ny, nu))
-    return LinearFit(
-        B=theta[:b].reshape(nu, nx).T,
-        D=D,
-        x0=x0,
-        residual=residual_power(equations, theta[:b], D, x0),
-    )
+    `(ny, L, L + nx, nx + 1)`: output, sample, source, coefficient.
+    """
+    size, ny, nx = impulse.shape
+    t, i = np.arange(size)[:, None], np.arange(size)[None, :]
+    silent = jnp.concatenate([impulse, jnp.zeros((1, ny, nx))])
+    delayed = silent[np.where(i < t, t - 1 - i, size)].transpose(2, 0, 1, 3)
+    start = jnp.broadcast_to(powers[None], (ny, size, nx, nx))
+    regressors = jnp.concatenate([delayed, start], axis=2)
+    itself = np.broadcast_to(np.eye(size, size + nx)[None, :, :, None], (*regressors.shape[:3], 1))
+    return jnp.concatenate([regressors, jnp.asarray(itself)], axis=3)
 
 
-def residual_power(
-    equations: NormalEquations,
-    b: Float[Array, " entry"],
-    D: Float[Array, "ny nu"],
-    x0: Float[Array, "record nx"],
-) -> Float[Array, " ny"]:
-    """Sum of squares of what B, D and x0 leave of each output."""
-    entries = jnp.concatenate([jnp.broadcast_to(b[None], (x0.shape[0], b.shape[0])), x0], axis=1)
-    quadratic = jnp.einsum("ra,rkab,rb->k", entries, equations.states, entries)
-    quadratic += 2.0 * jnp.einsum("ra,rkaj,kj->k", entries, equations.states_inputs, D)
-    quadratic += jnp.einsum("ki,rij,kj->k", D, equations.inputs, D)
-    linear = jnp.einsum("ra,rka->k", entries, equations.states_outputs)
-    linear += jnp.einsum("kj,rkj->k", D, equations.inputs_outputs)
-    return jnp.maximum(quadratic - 2.0 * linear + jnp.sum(equations.outputs, axis=0), 0.0)
+def _rows(nu: int, ny: int, nx: int, size: int) -> np.ndarray:
+    """Where the sources of output k and channel j lie in [inputs, states]: `(ny, (nu+1) (L+nx))`.
+
+    x0 has no inputs of its own: those point one past the end, to a zero.
+    """
+    k, j = np.arange(ny)[:, None, None], np.arange(nu + 1)[None, :, None]
+    n_inputs, n_states = nu * size, (nu + 1) * ny * nx
+    inputs = np.where(j < nu, j * size + np.arange(size), n_inputs + n_states)
+    states = n_inputs + (j * ny + k) * nx + np.arange(nx)
+    inputs = np.broadcast_to(inputs, (ny, nu + 1, size))
+    return np.concatenate([inputs, states], axis=2).reshape(ny, -1)
 
 
-def solve_positive(
-    matrix: Float[Array, "row row"], right: Float[Array, "row column"]
-) -> Float[Array, "row column"]:
-    """Solve a symmetric positive definite system; the least-norm solution where it is singular."""
-    diagonal = jnp.diagonal(matrix)
-    scale = jnp.where(diagonal > 0.0, jax.lax.rsqrt(jnp.where(diagonal > 0.0, diagonal, 1.0)), 0.0)
-    scaled = matrix * scale[:, None] * scale[None, :]
-    scaled_right = right * scale[:, None]
-    factor = jax.lax.linalg.cholesky(scaled, symmetrize_input=False)
+def _contract(within: Array, gram: Array, nu: int) -> tuple[Array, Array]:
+    """Normal equations from the Gram matrix of [inputs, states] against [inputs, states, y]."""
+    ny, size, sources, coefficients = within.shape
+    channels = nu + 1
+    rows = _rows(nu, ny, sources - size, size)
+    known = gram.shape[0]
+    outputs = known + np.arange(size)[None, :] * ny + np.arange(ny)[:, None]
+    columns = np.concatenate([np.where(rows < known, rows, gram.shape[1]), outputs], axis=1)
+    bordered = jnp.pad(gram, ((0, 1), (0, 1)))
+    flat = (rows[:, :, None] * (gram.shape[1] + 1) + columns[:, None, :]).astype(np.int32)
+    sorted_out = bordered.reshape(-1).at[flat].get(mode="promise_in_bounds")
+    square, with_outputs = jnp.split(sorted_out, [channels * sources], axis=2)
 
-    def least_norm():
-        values, vectors = jnp.linalg.eigh(scaled)
-        kept = values > values[-1] * scaled.shape[0] * jnp.finfo(float).eps
-        inverse = jnp.where(kept, 1.0 / jnp.where(kept, values, 1.0), 0.0)
-        return vectors @ (inverse[:, None] * (vectors.T @ scaled_right))
+    # Sums over samples t and both sources; the first product makes the second one small.
+    once = jnp.einsum("kqjp,ktpa->kjaqt", square.reshape(ny, -1, channels, sources), within)
+    once = once.reshape(ny, channels * coefficients, channels, sources, size)
+    matrix = jnp.einsum("kzjpt,ktpb->kzjb", once, within)
+    right = jnp.einsum("kjpt,ktpa->kja", with_outputs.reshape(ny, channels, sources, size), within)
+    entries = channels * coefficients
+    return matrix.reshape(ny, entries, entries), right.reshape(ny, entries)
 
-    solution = jax.lax.cond(
-        jnp.all(jnp.isfinite(jnp.diagonal(factor))),
-        lambda: cho_solve((factor, True), scaled_right),
-        least_norm,
-    )
-    return solution * scale[:, None]
+
+def _prefix(increments: Array, powers: Array) -> Array:
+    """States s_b = Σ_{m ≤ b} e_m F^{b−m} for `(lane, block, nx)` increments e and powers of F.
+
+    A few blocks at once by one product with a block Toeplitz matrix; what those groups hand over
+    by doubling: s ← s + F^{2^i} s shifted by 2^i.
+    """
+    lanes, blocks, nx = increments.shape
+    groups = -(-blocks // _RADIX)
+    padded = jnp.pad(increments, ((0, 0), (0, groups * _RADIX - blocks), (0, 0)))
+    i, j = np.arange(_RADIX)[:, None], np.arange(_RADIX)[None, :]
+    lagged = powers.at[_RADIX].set(0.0)[np.where(j >= i, j - i, _RADIX)]
+    toeplitz = lagged.transpose(0, 2, 1, 3).reshape(_RADIX * nx, _RADIX * nx)
+    local = padded.reshape(lanes * groups, _RADIX * nx) @ toeplitz
+    local = local.reshape(lanes, groups, _RADIX, nx)
+
+    def double(i, carry):
+        ends, jump = carry
+        shift = 2**i
+        earlier = jnp.roll(ends, shift, axis=1)
+        valid = (jnp.arange(groups) >= shift)[None, :, None]
+        return ends + jnp.where(valid, earlier, 0.0) @ jump, jump @ jump
+
+    steps = max(groups - 1, 0).bit_length()
+    ends, _ = jax.lax.fori_loop(0, steps, double, (local[:, :, -1], powers[_RADIX]))
+    handed = jnp.pad(ends[:, :-1], ((0, 0), (1, 0), (0, 0))).reshape(lanes * groups, nx)
+    carried = handed @ powers[1:].transpose(1, 0, 2).reshape(nx, _RADIX * nx)
+    total = local + carried.reshape(lanes, groups, _RADIX, nx)
+    return total.reshape(lanes, groups * _RADIX, nx)[:, :blocks]

@@ -108,5 +108,3 @@ class MechanicalStructure(AbstractStructure):
         )
         scatter = 0.5 * jax.random.normal(key, (count, self.n_parameters))
         return centre[None] + scatter.at[0].set(0.0)
-
-

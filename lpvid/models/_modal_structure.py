@@ -9,7 +9,6 @@ from jaxtyping import Array, PRNGKeyArray
 from lpvid.models._state_space import StateSpace
 from lpvid.models._structures import AbstractStructure, Parameters, Starts
 
-
 # Damping ratio that stands in for a mode found unstable.
 _LEAST_DAMPING = 1e-4
 
@@ -71,7 +70,9 @@ class ModalStructure(AbstractStructure):
         modes = parameters[:count].reshape(self.n_modes, self._per_mode)
         shapes = modes[:, 2 : 2 + 2 * self.n_outputs].reshape(self.n_modes, self.n_outputs, 2)
         inputs = modes[:, 2 + 2 * self.n_outputs :].reshape(self.n_modes, 2, self.n_inputs - 1)
-        direct = parameters[count:] if self.feedthrough else jnp.zeros(self.n_outputs * self.n_inputs)
+        direct = (
+            parameters[count:] if self.feedthrough else jnp.zeros(self.n_outputs * self.n_inputs)
+        )
         frequency, damping = jnp.exp(modes[:, 0]), jnp.exp(modes[:, 1])
         return frequency, damping, shapes, inputs, direct.reshape(self.n_outputs, -1)
 
@@ -190,6 +191,8 @@ def _pole_pairs(poles: np.ndarray) -> list[np.ndarray]:
     for k in upper:
         partner = int(np.argmin(np.abs(poles - np.conj(poles[k]))))
         pairs.append(np.array([k, partner]))
-    real = sorted((k for k in range(len(poles)) if poles[k].imag == 0), key=lambda k: -poles[k].real)
+    real = sorted(
+        (k for k in range(len(poles)) if poles[k].imag == 0), key=lambda k: -poles[k].real
+    )
     pairs += [np.array(real[k : k + 2]) for k in range(0, len(real) - 1, 2)]
     return pairs

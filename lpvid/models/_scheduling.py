@@ -24,7 +24,9 @@ class Polynomial(eqx.Module):
 
     def __check_init__(self):
         if self.degree != "auto" and not (isinstance(self.degree, int) and self.degree >= 0):
-            raise ValueError(f"degree: a whole number from 0 or 'auto' is needed, got {self.degree!r}.")
+            raise ValueError(
+                f"degree: a whole number from 0 or 'auto' is needed, got {self.degree!r}."
+            )
 
 
 class PolynomialBasis(eqx.Module):

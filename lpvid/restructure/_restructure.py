@@ -272,5 +272,3 @@ def _initial(initial: ArrayLike | None, structure: AbstractStructure) -> Array |
             f"{vectors.shape}; see structure.parameter_names."
         )
     return vectors
-
-

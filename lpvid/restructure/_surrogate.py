@@ -101,7 +101,9 @@ def _refined(structure, parameters, target: Target, peaks: Peaks) -> Target:
     poles = jax.lax.stop_gradient(structure.matrices(parameters)).poles()
     extra = jnp.concatenate([jnp.abs(jnp.imag(poles)), peaks])
     extra = jnp.where(jnp.isfinite(extra), extra, 0.0)
-    grid = jnp.concatenate([target.omega, 0.9 * extra, 0.97 * extra, extra, 1.03 * extra, 1.1 * extra])
+    grid = jnp.concatenate(
+        [target.omega, 0.9 * extra, 0.97 * extra, extra, 1.03 * extra, 1.1 * extra]
+    )
     return Target(grid, target.black_box.frequency_response(grid), target.black_box)
 
 

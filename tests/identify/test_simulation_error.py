@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lpvid.identify import _simulation_error as se
+from lpvid.identify._linear_fit import solve, solve_positive
 
 from .helpers import prbs, respond, three_modes
 
@@ -34,13 +35,13 @@ def test_normal_equations_are_those_of_the_filtered_regressors(n, monkeypatch):
     u, y = rng.standard_normal((n, 2)), rng.standard_normal((n, 2))
     found = jax.jit(se.normal_equations)(*arrays(A, C, u, y))
     for k, phi in enumerate(regressors(A, C, u)):
+        # Entries by channel: nx regressors, then the input; x0 has none.
+        parts = [phi[:, :6], u[:, :1], phi[:, 6:12], u[:, 1:], phi[:, 12:], np.zeros((n, 1))]
+        whole = np.concatenate(parts, axis=1)
         close = dict(rtol=1e-10, atol=1e-9)
-        np.testing.assert_allclose(found.states[k], phi.T @ phi, **close)
-        np.testing.assert_allclose(found.states_inputs[k], phi.T @ u, **close)
-        np.testing.assert_allclose(found.states_outputs[k], phi.T @ y[:, k], **close)
-        np.testing.assert_allclose(found.inputs_outputs[k], u.T @ y[:, k], **close)
-    np.testing.assert_allclose(found.inputs, u.T @ u, **close)
-    np.testing.assert_allclose(found.outputs, np.sum(y**2, axis=0), **close)
+        np.testing.assert_allclose(found.matrix[k], whole.T @ whole, **close)
+        np.testing.assert_allclose(found.right[k], whole.T @ y[:, k], **close)
+    np.testing.assert_allclose(found.power, np.sum(y**2, axis=0), **close)
 
 
 @pytest.mark.parametrize("feedthrough", [True, False])
@@ -50,7 +51,7 @@ def test_solution_is_the_least_squares_one(feedthrough):
     rng = np.random.default_rng(3)
     u, y = rng.standard_normal((161, 2)), rng.standard_normal((161, 2))
     equations = recorded(*arrays(A, C, u, y), lengths=lengths)
-    found = se.solve(equations, feedthrough=feedthrough)
+    found = solve(equations, nx=6, feedthrough=feedthrough)
 
     columns = 12 + 4 + 18
     blocks, start = [], 0
@@ -78,7 +79,7 @@ def test_recovers_the_system_that_made_the_data():
     A, B, C, D = three_modes()
     u, x0 = prbs(700, 2), np.arange(6.0)
     y = respond((A, B, C, D), u, x0)
-    found = se.solve(recorded(*arrays(A, C, u, y), lengths=(700,)), feedthrough=True)
+    found = solve(recorded(*arrays(A, C, u, y), lengths=(700,)), nx=6, feedthrough=True)
     for value, truth in ((found.B, B), (found.D, D), (found.x0[0], x0)):
         np.testing.assert_allclose(value, truth, atol=1e-11)
 
@@ -87,7 +88,7 @@ def test_singular_systems_get_the_least_norm_solution():
     matrix = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     right = np.array([[2.0], [2.0], [0.0]])
     np.testing.assert_allclose(
-        se.solve_positive(jnp.asarray(matrix), jnp.asarray(right))[:, 0],
+        solve_positive(jnp.asarray(matrix), jnp.asarray(right))[:, 0],
         [1.0, 1.0, 0.0],
         atol=1e-12,
     )
