@@ -40,7 +40,7 @@ def is_successful(status: Status):
 
 
 class Solution(eqx.Module):
-    """Outcome of one minimisation: the best point seen, its cost, the status and the steps taken."""
+    """Outcome of one minimisation: the best point seen, its cost, status and steps taken."""
 
     value: Float[Array, " parameter"]
     cost: Float[Array, ""]

@@ -1,4 +1,4 @@
-"""The study of Vizer et al. (2015): from noisy local records to a global LPV model, and its check."""
+"""The study of Vizer et al. (2015): noisy local records to a global LPV model, and its check."""
 
 import time
 from collections.abc import Callable, Sequence

@@ -13,8 +13,7 @@ def simulate(
     u: Numbers,
     x0: Numbers | None = None,
     dt: float | None = None,
-    return_state: bool = False,
-) -> Array | tuple[Array, Array]:
+) -> Float[Array, "*batch time ny"]:
     """Response of a model to an input; see `StateSpace.simulate`, which this calls.
 
     Example:
@@ -23,7 +22,7 @@ def simulate(
         >>> simulate(StateSpace([[0.5]], [[1.0]], [[1.0]], dt=0.1), u=np.ones(3))[:, 0].tolist()
         [0.0, 1.0, 1.5]
     """
-    return system.simulate(u=u, x0=x0, dt=dt, return_state=return_state)
+    return system.simulate(u=u, x0=x0, dt=dt)
 
 
 def simulate_time_varying(

@@ -158,13 +158,8 @@ class StateSpace(eqx.Module):
         return f"StateSpace(nx={self.nx}, nu={self.nu}, ny={self.ny}, {time}{batch})"
 
     def simulate(
-        self,
-        *,
-        u: Numbers,
-        x0: Numbers | None = None,
-        dt: float | None = None,
-        return_state: bool = False,
-    ) -> Array | tuple[Array, Array]:
+        self, *, u: Numbers, x0: Numbers | None = None, dt: float | None = None
+    ) -> Float[Array, "*batch time ny"]:
         """Response to an input.
 
         Args:
@@ -172,10 +167,9 @@ class StateSpace(eqx.Module):
             x0: first state (nx,), with any batch axes; zero when left out.
             dt: sample time in seconds of `u`; needed for a continuous-time model, which is
                 converted by a zero-order hold first.
-            return_state: also return the states (time, nx) at the sample instants.
 
         Returns:
-            Output (time, ny), with the batch axes in front; with the states if asked for.
+            Output (time, ny), with the batch axes in front.
 
         Raises:
             ValueError: shapes do not fit, or the sample time is missing or contradicts the model's.
@@ -186,6 +180,20 @@ class StateSpace(eqx.Module):
             >>> StateSpace([[0.5]], [[1.0]], [[1.0]], dt=0.1).simulate(u=np.ones(3))[:, 0].tolist()
             [0.0, 1.0, 1.5]
         """
+        system, u, x0 = self._prepared(u, x0, dt)
+        return simulate_lti(system.A, system.B, system.C, system.D, u=u, x0=x0)
+
+    def simulate_states(
+        self, *, u: Numbers, x0: Numbers | None = None, dt: float | None = None
+    ) -> Float[Array, "*batch time nx"]:
+        """States (time, nx) at the sample instants; arguments and errors as for `simulate`."""
+        system, u, x0 = self._prepared(u, x0, dt)
+        identity, nothing = jnp.eye(self.nx), jnp.zeros((self.nx, self.nu))
+        return simulate_lti(system.A, system.B, identity, nothing, u=u, x0=x0)
+
+    def _prepared(
+        self, u: Numbers, x0: Numbers | None, dt: float | None
+    ) -> tuple["StateSpace", Array, Array]:
         system = self._at_sample_time(dt)
         u = jnp.asarray(u, float)
         if u.ndim == 1 and self.nu == 1:
@@ -198,12 +206,7 @@ class StateSpace(eqx.Module):
         x0 = jnp.zeros(self.nx) if x0 is None else jnp.asarray(x0, float)
         if x0.ndim < 1 or x0.shape[-1] != self.nx:
             raise ValueError(f"x0 has shape {x0.shape}; the model has {self.nx} states.")
-        A, B, C, D = system.A, system.B, system.C, system.D
-        if not return_state:
-            return simulate_lti(A, B, C, D, u=u, x0=x0)
-        states = simulate_lti(A, B, jnp.eye(self.nx), jnp.zeros((self.nx, self.nu)), u=u, x0=x0)
-        y = states @ C.mT + u @ D.mT
-        return y, states
+        return system, u, x0
 
     def _at_sample_time(self, dt: float | None) -> "StateSpace":
         if self.is_discrete:
