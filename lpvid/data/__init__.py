@@ -10,6 +10,7 @@ from lpvid.data._lowpass import Lowpass as Lowpass
 from lpvid.data._mat import read_mat as read_mat
 from lpvid.data._npz import read_npz as read_npz
 from lpvid.data._pandas import from_pandas as from_pandas
+from lpvid.data._periodic import PeriodicBand as PeriodicBand
 from lpvid.data._preprocess import AbstractReversal as AbstractReversal
 from lpvid.data._preprocess import AbstractStep as AbstractStep
 from lpvid.data._preprocess import Undo as Undo

@@ -3,6 +3,7 @@
 import functools
 import math
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -119,45 +120,53 @@ def identify(
             "identify one record without them first, and give its order here."
         )
     settings = dict(method=method, block_rows=block_rows, lengths=data.lengths)
-    result = _run(data, "gram", settings)
-    if traced:
-        return _as_fit(result, data)
+    route: Route = "gram"
+    found = _range(data.u, data.y, route=route, **settings)
     # Not `<`: a factorisation that broke down says NaN.
-    if not float(result["smallest_pivot"]) > ILL_CONDITIONED:
+    if not traced and not float(found["smallest_pivot"]) > ILL_CONDITIONED:
         if throw:
             check_varying(data)
-        result = _run(data, "qr", settings)
-    result = _free_unstable(result, data, method, block_rows)
-    fit = _as_fit(result, data)
-    _report(fit, data, block_rows, throw)
+        route = "qr"
+        found = _range(data.u, data.y, route=route, **settings)
+    order = method.order
+    if order == "auto":
+        values = np.asarray(found["singular_values"])
+        order = choose_order(values, largest_order(block_rows, data.ny))
+    complete = functools.partial(
+        _complete,
+        found,
+        data.u,
+        data.y,
+        negligible(route),
+        order=order,
+        full_rank=2 * block_rows * data.nu,
+        feedthrough=method.feedthrough,
+        stabilise=method.stabilise,
+    )
+    result = complete(windows=data.lengths)
+    if not traced and float(result["spectral_radius"]) > 1.0 + _STABILITY_MARGIN:
+        result = _free_unstable(result, complete, data.lengths, 2 * block_rows)
+    found = {name: found[name] for name in _RANGE_STATS}
+    fit = _as_fit(result, found | dict(reflections=jnp.asarray(route == "qr")), data)
+    if not traced and fit.status != Status.successful:
+        _report(fit, data, block_rows, negligible(route), throw)
     return fit
 
 
-def _run(data: IOData, route: Route, settings: dict) -> dict[str, Any]:
-    method = settings["method"]
-    if method.order != "auto":
-        return _whole(data.u, data.y, order=method.order, route=route, **settings)
-    found = _range(data.u, data.y, route=route, **settings)
-    largest = largest_order(settings["block_rows"], data.ny)
-    order = choose_order(np.asarray(found["singular_values"]), largest)
-    return _complete(found, data.u, data.y, order=order, method=method, windows=data.lengths)
+_RANGE_STATS = ("singular_values", "smallest_pivot", "excitation_rank")
 
 
-def _as_fit(result: dict[str, Any], data: IOData) -> Fit:
-    result = dict(result)
-    model = StateSpace(result.pop("A"), result.pop("B"), result.pop("C"), result.pop("D"), data.dt)
+def _as_fit(result: dict[str, Any], found: dict[str, Any], data: IOData) -> Fit:
+    stats = found | result
+    model = StateSpace(*(stats.pop(name) for name in "ABCD"), data.dt)
     return Fit(
         model=model,
-        x0=result.pop("x0"),
-        singular_values=result.pop("singular_values"),
+        x0=stats.pop("x0"),
+        singular_values=stats.pop("singular_values"),
         order=model.nx,
-        status=result.pop("status"),
-        stats={name: value for name, value in result.items() if name not in _PASSED_ON},
+        status=stats.pop("status"),
+        stats=stats,
     )
-
-
-# What one stage hands to the next and no user needs.
-_PASSED_ON = ("scale", "vectors")
 
 
 @functools.partial(jax.jit, static_argnames=("method", "block_rows", "lengths", "route"))
@@ -186,40 +195,37 @@ def _range(u, y, *, method, block_rows, lengths, route):
         scale=scale,
         smallest_pivot=conditioning.smallest_pivot,
         excitation_rank=conditioning.excitation_rank,
-        full_rank=conditioning.excitation_rank == 2 * block_rows * u.shape[1],
-        reflections=jnp.asarray(route == "qr"),
-        negligible=jnp.asarray(negligible(route)),
     )
 
 
-@functools.partial(jax.jit, static_argnames=("method", "order", "windows"))
-def _complete(found, u, y, *, method, order, windows):
+@functools.partial(
+    jax.jit, static_argnames=("order", "full_rank", "feedthrough", "stabilise", "windows")
+)
+def _complete(found, u, y, rounding, *, order, full_rank, feedthrough, stabilise, windows):
     """A and C of a given order, then B, D and x0 of every window."""
-    found = dict(found)
     nu = u.shape[1]
     scale = found["scale"]
     values = found["singular_values"]
     observability = found["vectors"][:, :order] * jnp.sqrt(values[:order])[None, :]
     A, C = realise(observability, y.shape[1])
     moved = jnp.asarray(0)
-    if method.stabilise is not False:
-        A, moved = move_inside(A, method.stabilise)
+    if stabilise is not False:
+        A, moved = move_inside(A, stabilise)
     linear = solve(
         record_equations(A, C, u / scale[None, :nu], y / scale[None, nu:], windows),
         nx=order,
-        feedthrough=method.feedthrough,
+        feedthrough=feedthrough,
     )
     B = linear.B / scale[None, :nu]
     D = linear.D * scale[nu:, None] / scale[None, :nu]
     C = C * scale[nu:, None]
     radius = spectral_radius(A)
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in (A, B, C, D, linear.x0)]))
-    short = values[order - 1] <= found.pop("negligible") * values[0]
-    poor = short | ~found.pop("full_rank")
+    poor = (values[order - 1] <= rounding * values[0]) | (found["excitation_rank"] < full_rank)
     status = Status.where(radius > 1.0 + _STABILITY_MARGIN, Status.unstable, Status.successful)
     status = Status.where(poor, Status.ill_conditioned, status)
     status = Status.where(finite, status, Status.nonfinite)
-    return found | dict(
+    return dict(
         A=A,
         B=B,
         C=C,
@@ -233,61 +239,29 @@ def _complete(found, u, y, *, method, order, windows):
     )
 
 
-@functools.partial(jax.jit, static_argnames=("method", "order", "block_rows", "lengths", "route"))
-def _whole(u, y, *, method, order, block_rows, lengths, route):
-    """Both stages as one compiled function, for an order known beforehand."""
-    found = _range(u, y, method=method, block_rows=block_rows, lengths=lengths, route=route)
-    return _complete(found, u, y, method=method, order=order, windows=lengths)
-
-
 def _free_unstable(
-    result: dict[str, Any], data: IOData, method: AbstractSubspaceMethod, block_rows: int
+    result: dict[str, Any], complete: Callable[..., dict], lengths: tuple[int, ...], least: int
 ) -> dict[str, Any]:
     """B and D of an unstable model from windows short enough that nothing grows out of bounds.
 
     The state is free at the start of every window, which is the simulation error of many short
     records; over the whole record the regressors would overflow.
     """
-    radius = float(result["spectral_radius"])
-    if not radius > 1.0 + _STABILITY_MARGIN:
-        return result
-    window = max(int(math.log(_LARGEST_GROWTH) / math.log(radius)), 2 * block_rows)
-    if window >= max(data.lengths):
+    growth = math.log(float(result["spectral_radius"]))
+    window = max(int(math.log(_LARGEST_GROWTH) / growth), least)
+    if window >= max(lengths):
         return result
     windows, firsts = [], []
-    for length in data.lengths:
+    for length in lengths:
         firsts.append(len(windows))
         count = max(length // window, 1)
         windows += [window] * (count - 1) + [length - (count - 1) * window]
-    found = {name: result[name] for name in _FOUND}
-    full_rank = 2 * block_rows * data.nu == result["excitation_rank"]
-    rounding = jnp.asarray(negligible("qr" if result["reflections"] else "gram"))
-    again = _complete(
-        found | dict(full_rank=full_rank, negligible=rounding),
-        data.u,
-        data.y,
-        method=method,
-        order=result["A"].shape[0],
-        windows=tuple(windows),
-    )
-    x0 = again["x0"][np.array(firsts)]
-    return again | dict(x0=x0, window=jnp.asarray(window))
+    again = complete(windows=tuple(windows))
+    return again | dict(x0=again["x0"][np.array(firsts)], window=jnp.asarray(window))
 
 
-_FOUND = (
-    "vectors",
-    "singular_values",
-    "scale",
-    "smallest_pivot",
-    "excitation_rank",
-    "reflections",
-)
-
-
-def _report(fit: Fit, data: IOData, block_rows: int, throw: bool) -> None:
+def _report(fit: Fit, data: IOData, block_rows: int, rounding: float, throw: bool) -> None:
     """Raise or warn, with the channel and the remedy."""
-    if fit.status == Status.successful:
-        return
     if fit.status == Status.unstable:
         warnings.warn(
             f"The identified model is unstable (spectral radius "
@@ -302,10 +276,7 @@ def _report(fit: Fit, data: IOData, block_rows: int, throw: bool) -> None:
                 raise ValueError(describe_excitation(data, block_rows))
             return
         values = np.asarray(fit.singular_values)
-        # The share below which `_complete` calls a singular value rounding.
-        rank = int(
-            np.sum(values > negligible("qr" if fit.stats["reflections"] else "gram") * values[0])
-        )
+        rank = int(np.sum(values > rounding * values[0]))
         warnings.warn(
             f"order={fit.order} is above the numerical rank of the data ({rank}): the states "
             f"beyond it are rounding noise. Use order={rank}, or data that excite more modes.",

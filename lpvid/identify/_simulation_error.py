@@ -2,7 +2,8 @@ r"""Normal equations of B, D and x0 in the simulation error, without the regress
 
 With A and C known, $y_k(t) = C_k A^t x_0 + \sum_j r_{kj}(t) B_j + \sum_j D_{kj} u_j(t)$ is linear
 in the rest, the regressors filtered: $r_{kj}(t+1) = r_{kj}(t) A + C_k u_j(t)$. They are never
-formed: within a block of L samples they are linear in its inputs and in the regressors at its start, so the normal equations follow from the Gram matrix of those over all blocks, contracted with
+formed: within a block of L samples they are linear in its inputs and in the regressors at its
+start, so the normal equations follow from the Gram matrix of those over all blocks, contracted with
 matrices that A and C alone fix. x0 is one more input channel, an impulse before the record.
 """
 

@@ -1,4 +1,5 @@
 import inspect
+import warnings
 
 import equinox as eqx
 import jax
@@ -61,19 +62,22 @@ def test_common_problem_reaches_the_goal(common, common_fit):
     assert np.all(percent > theirs)
     poles = sorted_poles(common_fit.model.A)
     np.testing.assert_allclose(poles, sorted_poles(three_modes()[0]), atol=1e-4)
-    np.testing.assert_allclose(poles, sorted_poles(slicot[0]), atol=1e-6)
+    # The same projection, once SLICOT's outputs have unit RMS as ours do.
+    rms = np.sqrt(np.mean(np.asarray(data.y) ** 2, axis=0))
+    scaled = slicot_moen4(np.asarray(data.u), np.asarray(data.y) / rms, 6, 20)
+    np.testing.assert_allclose(poles, sorted_poles(scaled[0]), atol=1e-9)
     noise = np.std(np.asarray(data.y) - np.asarray(clean.y), axis=0)
     np.testing.assert_allclose(common_fit.stats["residual_std"], noise, rtol=0.02)
 
 
-def test_past_inputs_alone_on_the_common_problem(common):
+def test_past_inputs_alone_on_the_common_problem(common, common_fit):
     data, clean = common
     fit = identify(data, PastInputMOESP(**SETTINGS))
     assert fit.status == Status.successful
-    assert np.all(simulation_fit(fit.model, clean) > 99.0)
+    percent = simulation_fit(fit.model, clean)
+    assert np.all(percent > 98.0)
     # Both are consistent; the past outputs are worth something.
-    both = identify(data, PastOutputMOESP(**SETTINGS))
-    assert np.all(simulation_fit(both.model, clean) > simulation_fit(fit.model, clean))
+    assert np.all(simulation_fit(common_fit.model, clean) > percent)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -141,7 +145,8 @@ def test_runs_under_lax_map_and_vmap_and_differentiates(common):
 
     ys = jnp.stack([data.y, 1.5 * data.y + 0.01 * data.u])
     alone = [poles_and_gain(y) for y in ys]
-    for batch in (jax.lax.map(poles_and_gain, ys), jax.vmap(poles_and_gain)(ys)):
+    mapped = jax.jit(lambda ys: jax.lax.map(poles_and_gain, ys))(ys)
+    for batch in (mapped, jax.jit(jax.vmap(poles_and_gain))(ys)):
         for k in range(2):
             np.testing.assert_allclose(batch[0][k], alone[k][0], rtol=1e-9)
             np.testing.assert_allclose(batch[1][k], alone[k][1], rtol=1e-8)
@@ -194,9 +199,19 @@ def test_stabilised_models_are_stable():
     assert int(fit.stats["eigenvalues_moved"]) == 1
     np.testing.assert_allclose(np.abs(sorted_poles(fit.model.A)).max(), 0.98, rtol=1e-9)
     # B and D are the best for the moved A: no other B does better on the data.
-    score = fit.stats["residual_std"]
-    y_hat = respond(matrices(fit.model), np.asarray(data.u), fit.x0[0])
-    np.testing.assert_allclose(np.std(np.asarray(data.y) - y_hat), score[0], rtol=0.05)
+    u, y = np.asarray(data.u), np.asarray(data.y)
+
+    def missed(B, D):
+        y_hat = respond((fit.model.A, B, fit.model.C, D), u, fit.x0[0])
+        return np.sqrt(np.mean((y - y_hat) ** 2))
+
+    B, D = np.asarray(fit.model.B), np.asarray(fit.model.D)
+    best = missed(B, D)
+    np.testing.assert_allclose(best, fit.stats["residual_std"][0], rtol=1e-9)
+    assert all(
+        missed(B + step, D) > best for step in 0.01 * np.vstack([np.eye(2), -np.eye(2)])[:, :, None]
+    )
+    assert missed(B, D + 0.1) > best and missed(B, D - 0.1) > best
 
 
 def test_order_above_the_rank_warns_and_names_the_rank():
@@ -231,7 +246,9 @@ def test_poor_data_name_the_channel(spoil, message):
     method = PastOutputMOESP(order=2, block_rows=6)
     with pytest.raises(ValueError, match=message):
         identify(data, method)
-    assert identify(data, method, throw=False).status != Status.successful
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert identify(data, method, throw=False).status != Status.successful
 
 
 def test_too_few_samples_say_how_many():
