@@ -27,6 +27,7 @@ from lpvid.data import Decimate as Decimate
 from lpvid.data import Detrend as Detrend
 from lpvid.data import IOData as IOData
 from lpvid.data import Lowpass as Lowpass
+from lpvid.data import Offset as Offset
 from lpvid.data import Scale as Scale
 from lpvid.data import from_pandas as from_pandas
 from lpvid.data import join as join

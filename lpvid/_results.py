@@ -5,7 +5,12 @@ from jaxtyping import Array, Float, Int
 
 
 class Status(eqx.Enumeration):
-    """Outcome of a computation; an integer code under `jit` and `vmap`, a sentence when printed."""
+    """Outcome of a computation; an integer code under `jit` and `vmap`, a sentence when printed.
+
+    Example:
+        >>> Status[Status.successful]
+        'Successful.'
+    """
 
     successful = "Successful."
     max_steps = (
@@ -40,7 +45,14 @@ def is_successful(status: Status):
 
 
 class Solution(eqx.Module):
-    """Outcome of one minimisation: the best point seen, its cost, status and steps taken."""
+    """Outcome of one minimisation.
+
+    Attributes:
+        value: the best point seen.
+        cost: its cost, infinite where it is not finite.
+        status: how the search ended.
+        steps: how many steps it took.
+    """
 
     value: Float[Array, " parameter"]
     cost: Float[Array, ""]

@@ -28,7 +28,16 @@ class Bounds(eqx.Module):
     """Lower and upper bounds, with the smooth change of variables that keeps within them.
 
     A one-sided bound becomes an exponential, a two-sided one a logistic curve; a free parameter
-    stays itself.
+    stays itself, and one with equal bounds is fixed.
+
+    Attributes:
+        lower: lower bounds, minus infinity where there is none.
+        upper: upper bounds, infinity where there is none.
+
+    Example:
+        >>> bounds = Bounds(jnp.array([0.0]), jnp.array([jnp.inf]))
+        >>> bounds.bounded(bounds.free(jnp.array([2.0]))).item()
+        2.0
     """
 
     lower: Parameters
@@ -37,15 +46,16 @@ class Bounds(eqx.Module):
     def free(self, bounded: Parameters) -> Parameters:
         """Unbounded coordinates of a point, which is first moved just inside the bounds."""
         low, high, has_low, has_high = self._finite()
-        margin = 1e-8 * jnp.where(
-            has_low & has_high, high - low, jnp.maximum(jnp.abs(bounded), 1.0)
-        )
-        inside = jnp.where(has_low, jnp.maximum(bounded, low + margin), bounded)
-        inside = jnp.where(has_high, jnp.minimum(inside, high - margin), inside)
-        share = jnp.where(has_low & has_high, (inside - low) / (high - low), 0.5)
+        two_sided = has_low & has_high & (high > low)
+        width = jnp.where(two_sided, high - low, 1.0)
+        share = jnp.where(two_sided, jnp.clip((bounded - low) / width, 1e-8, 1.0 - 1e-8), 0.5)
+        # With one bound there is no width to measure by: a point inside stays, however near.
+        margin = 1e-8 * jnp.maximum(jnp.abs(bounded), 1.0)
+        inside = jnp.where(has_low & (bounded <= low), low + margin, bounded)
+        inside = jnp.where(has_high & (bounded >= high), high - margin, inside)
         both = jnp.log(share) - jnp.log1p(-share)
-        above = jnp.log(jnp.where(has_low, inside - low, 1.0))
-        below = -jnp.log(jnp.where(has_high, high - inside, 1.0))
+        above = jnp.log(jnp.where(has_low & ~has_high, inside - low, 1.0))
+        below = -jnp.log(jnp.where(has_high & ~has_low, high - inside, 1.0))
         one = jnp.where(has_low, above, jnp.where(has_high, below, inside))
         return jnp.where(has_low & has_high, both, one)
 
@@ -81,7 +91,22 @@ def least_squares(
 ) -> Solution:
     """Minimise ½‖residual(x)‖² by Levenberg–Marquardt from one start; never raises.
 
-    The Jacobian is taken in forward mode. Use `jax.vmap` over `start` for several starts.
+    The Jacobian is taken in forward mode. Use `jax.vmap` over `start` for several starts. Works
+    under `jit`; derivatives of the minimum follow from the implicit function theorem.
+
+    Args:
+        residual: function of the parameters, real values of any shape.
+        start: where to begin.
+        max_steps: limit on the steps, rejected ones included.
+        tolerance: relative and absolute, on the last step and its gain.
+
+    Returns:
+        The best point seen, its cost ½‖residual‖² (infinite where it is not finite) and the
+        status: `successful`, `max_steps` or `nonfinite`.
+
+    Example:
+        >>> least_squares(lambda x: x - 3.0, jnp.zeros(1)).value.round(6).tolist()
+        [3.0]
     """
     solver = optx.BestSoFarLeastSquares(
         optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.QR())
@@ -110,7 +135,24 @@ def minimise(
     max_steps: int = 50,
     tolerance: float = 1e-9,
 ) -> Solution:
-    """Minimise a smooth function by L-BFGS (zoom line search) from one start; never raises."""
+    """Minimise a smooth function by L-BFGS (zoom line search) from one start; never raises.
+
+    Works under `jit` and `vmap` over `start`.
+
+    Args:
+        loss: smooth function of the parameters.
+        start: where to begin.
+        max_steps: limit on the steps.
+        tolerance: on the gradient's norm.
+
+    Returns:
+        The better one of the last point and the start, its cost (infinite where it is not finite)
+        and the status: `successful`, `max_steps` or `nonfinite`.
+
+    Example:
+        >>> minimise(lambda x: jnp.sum((x - 3.0) ** 2), jnp.zeros(1)).value.round(6).tolist()
+        [3.0]
+    """
     solver = jaxopt.LBFGS(loss, maxiter=max_steps, tol=tolerance, history_size=12, jit=True)
     value, state = solver.run(start)
     cost, first = loss(value), loss(start)

@@ -60,7 +60,8 @@ class StudyResult(eqx.Module):
         sweep_bft: BFT on the sweep by model name, one value for each output.
         sweep_vaf: VAF of the same.
         relative_cost: F(ϑ)/‖G_anal‖∞ of each point (001, table 2).
-        interpolation_fit: FIT by model name and degree, percent (001, table 3).
+        interpolation_fit: FIT by model name and degree, percent (001, table 3), for the degrees 1
+            and 2 where there are points enough.
         failed_runs: identifications that did not succeed, of all.
         seconds: wall time by stage.
     """
@@ -161,6 +162,7 @@ def run_study(
                 interpolation_fit(_interpolate(name, local[name], kappas, d), local[name], kappas)
             )
             for d in (1, 2)
+            if d < len(theta2)
         }
         for name in MODEL_NAMES
     }
@@ -210,7 +212,11 @@ def summary(result: StudyResult) -> dict:
             for name, values in result.interpolation_fit.items()
         },
         "hits": [int(found.hits) for found in result.restructured],
-        "margin": [float(found.margin) for found in result.restructured],
+        # JSON knows no infinity, which stands for "no second minimum".
+        "margin": [
+            float(found.margin) if np.isfinite(found.margin) else None
+            for found in result.restructured
+        ],
         "failed_runs": result.failed_runs,
         "seconds": sum(result.seconds.values()),
         "seconds_by_stage": result.seconds,
@@ -278,8 +284,8 @@ def _averages(models: StateSpace, succeeded: np.ndarray, theta2: Sequence[float]
     for index, kept in enumerate(succeeded):
         if not kept.any():
             raise ValueError(
-                f"theta2: no identification succeeded at {theta2[index]:.3g} rad; give longer records "
-                "or less noise."
+                f"theta2: no identification succeeded at {theta2[index]:.3g} rad; give longer "
+                "records or less noise."
             )
         chosen = np.flatnonzero(kept)
         members = jax.tree.map(lambda leaf, i=index, c=chosen: leaf[i][c], models)

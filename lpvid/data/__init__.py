@@ -9,6 +9,7 @@ from lpvid.data._join import join as join
 from lpvid.data._lowpass import Lowpass as Lowpass
 from lpvid.data._mat import read_mat as read_mat
 from lpvid.data._npz import read_npz as read_npz
+from lpvid.data._offset import Offset as Offset
 from lpvid.data._pandas import from_pandas as from_pandas
 from lpvid.data._periodic import PeriodicBand as PeriodicBand
 from lpvid.data._preprocess import AbstractReversal as AbstractReversal

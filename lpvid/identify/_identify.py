@@ -158,7 +158,8 @@ _RANGE_STATS = ("singular_values", "smallest_pivot", "excitation_rank")
 
 def _as_fit(result: dict[str, Any], found: dict[str, Any], data: IOData) -> Fit:
     stats = found | result
-    model = StateSpace(*(stats.pop(name) for name in "ABCD"), data.dt)
+    A, B, C, D = (stats.pop(name) for name in "ABCD")
+    model = StateSpace(A, B, C, D, data.dt)
     return Fit(
         model=model,
         x0=stats.pop("x0"),

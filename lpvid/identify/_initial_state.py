@@ -1,5 +1,7 @@
 """Initial states for a given model, and the fit they allow on data not seen."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ from jaxtyping import Array, Float
 from lpvid.data import IOData
 from lpvid.identify._linear_fit import solve_positive
 from lpvid.identify._simulation_error import record_equations
-from lpvid.models import StateSpace
+from lpvid.models import LPVStateSpace, StateSpace
 
 
 @jax.jit
@@ -30,7 +32,9 @@ def _least_squares_start(A, B, C, D, equations):
 _equations = jax.jit(record_equations, static_argnames="lengths")
 
 
-def estimate_initial_state(model: StateSpace, data: IOData) -> Float[Array, "record nx"]:
+def estimate_initial_state(
+    model: StateSpace | LPVStateSpace, data: IOData
+) -> Float[Array, "record nx"]:
     r"""Initial state of every record that minimises the model's simulation error.
 
     Least squares on $y(t) - \hat y(t; x_0 = 0) = C A^t x_0$, outputs weighted by their RMS; the
@@ -39,13 +43,16 @@ def estimate_initial_state(model: StateSpace, data: IOData) -> Float[Array, "rec
 
     **Arguments:**
 
-    - `model`: discrete-time, with the data's sample time.
+    - `model`: discrete-time, with the data's sample time; or an LPV model, for data with `kappa`.
     - `data`: one or several records.
 
     **Returns:** `(record, nx)`.
 
-    **Raises:** `ValueError` where sample times or channel counts differ.
+    **Raises:** `ValueError` where sample times or channel counts differ, and where an LPV model
+    meets data without scheduling.
     """
+    if isinstance(model, LPVStateSpace):
+        return jnp.stack([_lpv_start(model, record) for record in data.records])
     _check_match(model, data)
     power = jnp.sqrt(jnp.mean(data.y * data.y, axis=0))
     scale = jnp.where(power > 0.0, power, 1.0)
@@ -54,7 +61,7 @@ def estimate_initial_state(model: StateSpace, data: IOData) -> Float[Array, "rec
     return _least_squares_start(model.A, model.B, C, model.D / scale[:, None], equations)
 
 
-def simulation_fit(model: StateSpace, data: IOData) -> Float[Array, " ny"]:
+def simulation_fit(model: StateSpace | LPVStateSpace, data: IOData) -> Float[Array, " ny"]:
     r"""Best fit (BFT) of each output, in percent, with every record's initial state estimated.
 
     $100 \max(1 - \|y - \hat y\| / \|y - \bar y\|, 0)$ over all records together, the mean taken in
@@ -72,15 +79,51 @@ def simulation_fit(model: StateSpace, data: IOData) -> Float[Array, " ny"]:
         ```
     """
     starts = estimate_initial_state(model, data)
-    bounds = np.cumsum([0, *data.lengths])
-    missed = jnp.zeros(model.ny)
-    moved = jnp.zeros(model.ny)
-    for x0, first, last in zip(starts, bounds[:-1], bounds[1:], strict=True):
-        y = data.y[first:last]
-        simulated = jnp.asarray(model.simulate(u=data.u[first:last], x0=x0))
+    missed = jnp.zeros(data.ny)
+    moved = jnp.zeros(data.ny)
+    for x0, record in zip(starts, data.records, strict=True):
+        y = record.y
+        if isinstance(model, LPVStateSpace):
+            simulated = _lpv_response(model, record, record.u, x0)
+        else:
+            simulated = jnp.asarray(model.simulate(u=record.u, x0=x0))
         missed += jnp.sum((y - simulated) ** 2, axis=0)
         moved += jnp.sum((y - jnp.mean(y, axis=0, keepdims=True)) ** 2, axis=0)
     return 100.0 * jnp.maximum(1.0 - jnp.sqrt(missed / moved), 0.0)
+
+
+def _lpv_start(model: LPVStateSpace, record: IOData) -> Float[Array, " nx"]:
+    """Least squares on the response to each unit state along the record's scheduling."""
+    frozen = model.structure.matrices(model.parameters(_scheduling(record)[0]))
+    if (frozen.nu, frozen.ny) != (record.nu, record.ny):
+        raise ValueError(
+            f"model has {frozen.nu} inputs and {frozen.ny} outputs, the data {record.nu} and "
+            f"{record.ny}: choose channels with data.select."
+        )
+    power = jnp.sqrt(jnp.mean(record.y**2, axis=0))
+    scale = jnp.where(power > 0.0, power, 1.0)[None]
+    forced = _lpv_response(model, record, record.u, jnp.zeros(frozen.nx))
+    silent = jnp.zeros_like(record.u)
+    with warnings.catch_warnings():
+        # What the schedule does was said with the forced response.
+        warnings.simplefilter("ignore")
+        free = jax.vmap(lambda x0: _lpv_response(model, record, silent, x0) / scale)(
+            jnp.eye(frozen.nx)
+        )
+    left = ((record.y - forced) / scale).reshape(-1)
+    return jnp.linalg.lstsq(free.reshape(frozen.nx, -1).T, left)[0]
+
+
+def _lpv_response(model: LPVStateSpace, record: IOData, u: Array, x0: Array) -> Array:
+    return model.simulate(u=u, kappa=_scheduling(record), dt=record.dt, x0=x0)
+
+
+def _scheduling(record: IOData) -> Float[Array, "time nk"]:
+    if record.kappa is None:
+        raise ValueError(
+            "data: an LPV model needs the scheduling along the record; give kappa= to IOData."
+        )
+    return record.kappa
 
 
 def _check_match(model: StateSpace, data: IOData) -> None:

@@ -24,6 +24,16 @@ class TwoLinkArmStructure(AbstractStructure):
 
     A search in these entries meets unstable models and poor local minima; restructuring
     therefore looks for its starts in the dissipative form of the same plant.
+
+    Attributes:
+        lengths: ℓ of both links, m.
+        scales: rough sizes of the arm for the starts, if known.
+
+    Source: 001, equations 30 to 32 (indices of the printed equation corrected).
+
+    Example:
+        >>> TwoLinkArmStructure((0.35, 0.30)).n_parameters
+        16
     """
 
     lengths: tuple[float, float] = eqx.field(static=True)
@@ -55,9 +65,10 @@ class TwoLinkArmStructure(AbstractStructure):
 class ArmScales(NamedTuple):
     """Rough sizes of an arm: a factor of two or three off is good enough.
 
-    - `mobility`: diagonal of W = M⁻¹ for (θ1, θ2, v1, v2);
-    - `stiffness`: generalised stiffness of v1 and v2, 4 EI ℓ;
-    - `gains`: of the two velocity loops, N·m·s/rad.
+    Attributes:
+        mobility: diagonal of W = M⁻¹ for (θ1, θ2, v1, v2).
+        stiffness: generalised stiffness of v1 and v2, 4 EI ℓ.
+        gains: of the two velocity loops, N·m·s/rad.
     """
 
     mobility: Float[Array, "4"]
@@ -70,8 +81,19 @@ class DissipativeTwoLinkArm(AbstractStructure):
 
     ϑ1..4 = −k1 W[:, 2], ϑ5..8 = −k2 W[:, 3], ϑ9..12 = −λ1 W[:, 0], ϑ13..16 = −λ2 W[:, 1] with
     W = S L Lᵀ S by its logarithmic Cholesky factor, S the square root of the mobility scales.
-    Fourteen parameters, every value of which is a stable model; one common factor of (W, k, λ)
-    is not visible from outside.
+    Fourteen parameters, no value of which is an unstable model (only deflections that are not
+    coupled with any joint remain undamped); one common factor of (W⁻¹, k, λ) is not visible from
+    outside.
+
+    Attributes:
+        lengths: ℓ of both links, m.
+        scales: sizes that the parameters are relative to; ones by default.
+
+    Source: 001, equations 30 to 32, with M⁻¹ = W.
+
+    Example:
+        >>> DissipativeTwoLinkArm((0.35, 0.30)).entries(jnp.zeros(14))[2].item()
+        -1.0
     """
 
     lengths: tuple[float, float] = eqx.field(static=True)
@@ -151,26 +173,33 @@ def two_link_arm_structure(
 ) -> TwoLinkArmStructure:
     """Structure (32) of a two-link flexible arm with links of known `lengths` in metres.
 
-    `scales`, if given, says roughly how large mobility, stiffness and gains are; without it
-    the starts are scattered more widely, about sizes read off the black box.
+    Args:
+        lengths: of both links, m.
+        scales: roughly how large mobility, stiffness and gains are; without it the starts are
+            scattered more widely, about sizes read off the black box.
 
-    Raises `ValueError` where a length or a scale is not positive.
+    Raises:
+        ValueError: a length or a scale is not positive, or a scale has the wrong length.
 
     Source: 001, equations 30 to 32 (indices of the printed equation corrected).
 
-    **Example**
-
-        structure = two_link_arm_structure(lengths=(0.35, 0.30))
+    Example:
+        >>> two_link_arm_structure(lengths=(0.35, 0.30)).parameter_names[0]
+        'theta 1'
     """
     if len(lengths) != 2 or min(lengths) <= 0:
         raise ValueError(f"lengths: two positive numbers (metres) are needed, got {lengths}.")
     if scales is not None:
-        scales = ArmScales(*(_positive(name, value) for name, value in scales._asdict().items()))
+        scales = ArmScales(
+            mobility=_positive("mobility", scales.mobility, 4),
+            stiffness=_positive("stiffness", scales.stiffness, 2),
+            gains=_positive("gains", scales.gains, 2),
+        )
     return TwoLinkArmStructure((float(lengths[0]), float(lengths[1])), scales)
 
 
-def _positive(name: str, value: ArrayLike) -> Array:
+def _positive(name: str, value: ArrayLike, count: int) -> Array:
     array = jnp.asarray(value, float)
-    if not bool(jnp.all(array > 0)):
-        raise ValueError(f"scales: {name} must be positive, got {value}.")
+    if array.shape != (count,) or not bool(jnp.all(array > 0)):
+        raise ValueError(f"scales: {name} must hold {count} positive numbers, got {value}.")
     return array

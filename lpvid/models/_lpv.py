@@ -23,19 +23,23 @@ class LPVStateSpace(eqx.Module):
     `FreeStructure`, or any structure affine in ϑ, the matrices themselves are polynomials in κ
     (001, equation 35).
 
-    **Arguments**
+    Attributes:
+        structure: ϑ → (A, B, C, D), in continuous time.
+        basis: functions of κ.
+        coefficients: shape (basis.size, structure.n_parameters).
+        kappa_low: lower end of each scheduling variable's range at the points that the model was
+            built from.
+        kappa_high: its upper end.
 
-    - `structure`: ϑ → (A, B, C, D), in continuous time.
-    - `basis`: functions of κ, e.g. a `PolynomialBasis`.
-    - `coefficients`: shape (basis.size, structure.n_parameters).
-    - `kappa_low`, `kappa_high`: box around the points that the model was built from.
-    - `dt`: 0 for a continuous-time model (the only kind that interpolation makes).
-
-    **Example**
-
-        lpv = interpolate(models, kappas, Polynomial(degree=2))
-        y = lpv.simulate(u=u, kappa=kappa, dt=1e-3)
-        frozen = lpv.at(0.4)
+    Example:
+        >>> structure = FreeStructure(n_states=1, n_inputs=1, n_outputs=1, feedthrough=False)
+        >>> basis = polynomial_basis([0.0, 2.0], 1)
+        >>> coefficients = jnp.array([[-3.0, 1.0, 1.0], [1.0, 0.0, 0.0]])
+        >>> lpv = LPVStateSpace(structure, basis, coefficients, jnp.zeros(1), jnp.full(1, 2.0))
+        >>> lpv.at(1.5).A.tolist()
+        [[-2.5]]
+        >>> lpv.simulate(u=jnp.ones((3, 1)), kappa=jnp.linspace(0.0, 2.0, 3), dt=1e-3).shape
+        (3, 1)
     """
 
     structure: AbstractStructure
@@ -43,7 +47,6 @@ class LPVStateSpace(eqx.Module):
     coefficients: Float[Array, "basis parameter"]
     kappa_low: Float[Array, " scheduling"]
     kappa_high: Float[Array, " scheduling"]
-    dt: float = eqx.field(static=True, default=0.0)
 
     @property
     def n_scheduling(self) -> int:
@@ -55,7 +58,11 @@ class LPVStateSpace(eqx.Module):
         return self.basis(self._schedule(kappa)) @ self.coefficients
 
     def at(self, kappa: ArrayLike) -> StateSpace:
-        """The model frozen at one value of κ; warns outside the range it was built from."""
+        """The continuous-time model frozen at one value of κ; warns outside its range.
+
+        Raises:
+            ValueError: κ is not one point.
+        """
         point = self._schedule(kappa)
         if point.ndim != 1:
             raise ValueError(
@@ -66,7 +73,7 @@ class LPVStateSpace(eqx.Module):
         return self.structure.matrices(self.parameters(point))
 
     def is_inside(self, kappa: ArrayLike) -> Array:
-        """Whether κ lies within the box of the points that the model was built from."""
+        """Whether κ (…, n_scheduling) lies within the box of the points it was built from."""
         point = self._schedule(kappa)
         # A hair outside, as of a measured schedule at the end of its range, is no extrapolation.
         slack = 1e-3 * (self.kappa_high - self.kappa_low)
@@ -77,12 +84,23 @@ class LPVStateSpace(eqx.Module):
     def simulate(
         self, *, u: ArrayLike, kappa: ArrayLike, dt: float, x0: ArrayLike | None = None
     ) -> Float[Array, "time output"]:
-        """Response to u (time, n_inputs) along κ (time, n_scheduling), from x0 (zero).
+        """Response to an input along a schedule.
 
-        Input and scheduling are held constant over each sample of `dt` seconds, for which the
-        frozen model is discretised exactly. Differentiable in the coefficients, u, κ and x0.
+        Input and scheduling are held constant over each sample, for which the frozen model is
+        discretised exactly. Works under `jit` and `vmap`, forward and reverse derivatives in the
+        coefficients, u, κ and x0. Warns where κ leaves the range of the model (outside `jit`).
 
-        Raises `ValueError` for wrong shapes; warns where κ leaves the range of the model.
+        Args:
+            u: input (time, n_inputs), or (time,) for one input.
+            kappa: schedule (time, n_scheduling), or (time,) for one scheduling variable.
+            dt: sample time, s.
+            x0: first state, zero by default.
+
+        Returns:
+            Output (time, n_outputs).
+
+        Raises:
+            ValueError: shapes do not fit.
         """
         u = jnp.asarray(u, float)
         u = u[:, None] if u.ndim == 1 else u
@@ -98,6 +116,8 @@ class LPVStateSpace(eqx.Module):
     @eqx.filter_jit
     def _simulate(self, u, schedule, dt, x0):
         frozen = jax.vmap(self.structure.matrices)(self.parameters(schedule))
+        if frozen.nu != u.shape[1]:
+            raise ValueError(f"u: {frozen.nu} inputs are needed, got {u.shape[1]} columns.")
         # Batched, not vmapped: so the matrix exponential skips the squarings that no sample needs.
         discrete = c2d(frozen, dt)
         start = jnp.zeros(discrete.A.shape[-1]) if x0 is None else jnp.asarray(x0, float)
@@ -110,7 +130,8 @@ class LPVStateSpace(eqx.Module):
             point = point[..., None]
         if point.ndim == 0 or point.shape[-1] != self.n_scheduling:
             raise ValueError(
-                f"kappa: the last axis must hold {self.n_scheduling} values, got shape {point.shape}."
+                f"kappa: the last axis must hold {self.n_scheduling} values, got shape "
+                f"{point.shape}."
             )
         return point
 

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, PRNGKeyArray
 
 from lpvid.models._state_space import StateSpace
@@ -19,17 +20,20 @@ class MechanicalStructure(AbstractStructure):
     the lower triangle; logarithms on the diagonal), so that every ϑ is a stable model. The
     state is x = [q, q̇].
 
-    **Arguments**
+    Attributes:
+        n_degrees: degrees of freedom, each driven by one input.
+        measured: `"displacement"`, `"velocity"` or `"acceleration"`.
 
-    - `n_degrees`: degrees of freedom, each driven by one input.
-    - `measured`: `"displacement"`, `"velocity"` or `"acceleration"`.
+    Raises:
+        ValueError: `n_degrees` is below one, or `measured` is none of the three.
 
     Source: 000, equations 1 to 4.
 
-    **Example**
-
-        structure = MechanicalStructure(n_degrees=2)
-        mass, damping, stiffness = structure.mechanical_matrices(best.parameters)
+    Example:
+        >>> structure = MechanicalStructure(n_degrees=1)
+        >>> mass, damping, stiffness = structure.mechanical_matrices(jnp.zeros(3))
+        >>> stiffness.item()
+        1.0
     """
 
     n_degrees: int = eqx.field(static=True)
@@ -69,10 +73,16 @@ class MechanicalStructure(AbstractStructure):
         return factor @ factor.T
 
     def parameters_of(self, mass: Array, damping: Array, stiffness: Array) -> Parameters:
-        """ϑ of given symmetric positive definite matrices."""
+        """ϑ of given symmetric positive definite matrices, each (n_degrees, n_degrees).
+
+        Raises:
+            ValueError: a matrix is not positive definite (checked outside `jit` only).
+        """
         parts = []
-        for matrix in (mass, damping, stiffness):
+        for name, matrix in (("mass", mass), ("damping", damping), ("stiffness", stiffness)):
             factor = jnp.linalg.cholesky(jnp.asarray(matrix, float))
+            if not isinstance(factor, Tracer) and not bool(jnp.all(jnp.isfinite(factor))):
+                raise ValueError(f"{name}: it is not positive definite, which the structure is.")
             diagonal = jnp.diag(factor)
             relative = jnp.tril(factor / diagonal[:, None], -1) + jnp.diag(jnp.log(diagonal))
             parts.append(relative[self._lower])

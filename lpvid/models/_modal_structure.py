@@ -27,10 +27,19 @@ class ModalStructure(AbstractStructure):
     `feedthrough`. With the logarithms every ϑ is a stable model, also between and beyond the
     points of an interpolation; damping above one stands for two real poles.
 
-    **Example**
+    Attributes:
+        n_modes: second-order modes.
+        n_inputs: number of inputs.
+        n_outputs: number of outputs.
+        feedthrough: whether D is free; zero otherwise.
+        reference_input: the input whose column of B is fixed.
 
-        structure = ModalStructure(n_modes=3, n_inputs=1, n_outputs=3, feedthrough=True)
-        best = restructure(black_box, structure)
+    Raises:
+        ValueError: there is no mode, or `reference_input` is not one of the inputs.
+
+    Example:
+        >>> ModalStructure(n_modes=1, n_inputs=1, n_outputs=1).parameter_names
+        ('mode 1 log frequency', 'mode 1 log damping', 'mode 1 C[0,0]', 'mode 1 C[0,1]')
     """
 
     n_modes: int = eqx.field(static=True)
@@ -94,16 +103,23 @@ class ModalStructure(AbstractStructure):
     def parameters_of(self, model: StateSpace) -> Parameters:
         """ϑ of a continuous-time model of order 2·n_modes, from its eigenvectors (eager).
 
-        An unstable mode is given a small positive damping: the structure holds stable models only.
+        Real poles are paired from the slowest. An unstable mode is given a small positive damping:
+        the structure holds stable models only. Needs simple poles.
 
-        Raises `ValueError` where the order differs, where real poles cannot be paired into
-        second-order blocks, or where the reference input leaves a mode unexcited.
+        Raises:
+            ValueError: order or channels differ, a pole lies at zero, or the reference input
+                leaves a mode unexcited.
         """
         nx = 2 * self.n_modes
         if model.nx != nx or model.dt != 0:
             raise ValueError(
                 f"model: a continuous-time model of order {nx} is needed, got order {model.nx} "
                 f"and dt={model.dt}; identify with order={nx} and convert with d2c."
+            )
+        if (model.nu, model.ny) != (self.n_inputs, self.n_outputs):
+            raise ValueError(
+                f"model: {self.n_inputs} inputs and {self.n_outputs} outputs are needed, got "
+                f"{model.nu} and {model.ny}."
             )
         poles, vectors = np.linalg.eig(np.asarray(model.A))
         rows = np.linalg.solve(vectors, np.asarray(model.B, complex))
@@ -117,6 +133,8 @@ class ModalStructure(AbstractStructure):
 
     def _block(self, poles, rows, columns) -> np.ndarray:
         frequency = float(np.sqrt(np.abs(poles[0] * poles[1])))
+        if frequency == 0.0:
+            raise ValueError("model: a pole at zero has no frequency; remove the integrator first.")
         damping = max(float(-np.real(poles[0] + poles[1]) / (2 * frequency)), _LEAST_DAMPING)
         A = np.array([[0, frequency], [-frequency, -2 * damping * frequency]])
         # The same pair of poles in the structure's basis: B = T [0, 1]' there fixes T, as T
@@ -159,8 +177,8 @@ class ModalStructure(AbstractStructure):
         pairs = _pole_pairs(poles)
         if len(pairs) < self.n_modes:
             raise ValueError(
-                f"black_box: order {model.nx} has {len(pairs)} modes, the structure {self.n_modes}; "
-                "identify with a higher order or lower n_modes."
+                f"black_box: order {model.nx} has {len(pairs)} modes, the structure "
+                f"{self.n_modes}; identify with a higher order or lower n_modes."
             )
 
         def peak(pair):
@@ -185,7 +203,7 @@ class ModalStructure(AbstractStructure):
 
 
 def _pole_pairs(poles: np.ndarray) -> list[np.ndarray]:
-    """Conjugate pairs, and real poles two by two from the slowest; an odd one out raises."""
+    """Conjugate pairs, and real poles two by two from the slowest; an odd one is left out."""
     upper = [k for k in range(len(poles)) if poles[k].imag > 0]
     pairs = []
     for k in upper:

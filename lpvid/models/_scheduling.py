@@ -11,13 +11,15 @@ from jaxtyping import Array, ArrayLike, Float
 class Polynomial(eqx.Module):
     """Polynomial dependence on κ, up to a total degree (001, equation 35).
 
-    **Arguments**
+    Attributes:
+        degree: total degree, 0 or more; or `"auto"`, chosen by leaving one point out.
 
-    - `degree`: total degree, 0 or more; or `"auto"`, chosen by leaving one point out.
+    Raises:
+        ValueError: the degree is neither a whole number from 0 nor `"auto"`.
 
-    **Example**
-
-        lpv = interpolate(models, kappas, Polynomial(degree=2))
+    Example:
+        >>> Polynomial(degree=2).degree
+        2
     """
 
     degree: int | str = eqx.field(static=True, default=2)
@@ -32,8 +34,12 @@ class Polynomial(eqx.Module):
 class PolynomialBasis(eqx.Module):
     """The monomials of κ up to a total degree, in κ centred and scaled to [−1, 1].
 
-    Centring keeps the least-squares problem well conditioned; `monomials` gives the
-    exponents, so that coefficients of plain powers can be worked out.
+    Centring keeps the least-squares problem well conditioned.
+
+    Attributes:
+        centre: middle of the range of each scheduling variable.
+        half_range: half its width.
+        exponents: of each basis function, one for each scheduling variable.
     """
 
     centre: Float[Array, " scheduling"]
@@ -61,8 +67,18 @@ class PolynomialBasis(eqx.Module):
 
 
 def polynomial_basis(kappas: ArrayLike, degree: int) -> PolynomialBasis:
-    """The polynomial basis for points `kappas` (n_points, n_scheduling) up to a total degree."""
+    """The polynomial basis up to a total degree, centred on given points.
+
+    Args:
+        kappas: points, shape (n_points,) or (n_points, n_scheduling).
+        degree: largest sum of the exponents.
+
+    Example:
+        >>> polynomial_basis([0.0, 2.0], 2)([1.5]).tolist()
+        [1.0, 0.5, 0.25]
+    """
     points = np.asarray(kappas, float)
+    points = points[:, None] if points.ndim == 1 else points
     low, high = points.min(axis=0), points.max(axis=0)
     half_range = np.where(high > low, (high - low) / 2, 1.0)
     exponents = [

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from lpvid.models._state_space import StateSpace
@@ -19,8 +20,7 @@ class AbstractStructure(eqx.Module):
     """A map ϑ → (A, B, C, D) in continuous time, with names, bounds and an optional start rule.
 
     A concrete structure defines `parameter_names` and `matrices`. The other methods have
-    defaults: no bounds, starts scattered about `nominal` where there is one, and no second
-    parameterisation to search in.
+    defaults: no bounds, no start rule, and no second parameterisation to search in.
 
     Source: 001, equations 1, 6 and 32.
     """
@@ -45,7 +45,20 @@ class AbstractStructure(eqx.Module):
         return -infinite, infinite
 
     def starts(self, key: PRNGKeyArray, count: int, black_box: StateSpace) -> Starts:
-        """`count` starting points for a search, the first one the best guess."""
+        """`count` starting points for a search, the first one the best guess.
+
+        Args:
+            key: random key.
+            count: how many.
+            black_box: continuous-time model that the structure is to match.
+
+        Returns:
+            Starting points (count, n_parameters) of `search_structure()`'s parameters, or of this
+            structure's where that is None.
+
+        Raises:
+            ValueError: the structure has no start rule.
+        """
         del key, count, black_box
         raise ValueError(
             f"{type(self).__name__} has no start rule: give `initial=` (one or several "
@@ -64,10 +77,15 @@ class AbstractStructure(eqx.Module):
 class FreeStructure(AbstractStructure):
     """Every entry of A, B, C (and D) is a parameter, row by row: a black box as a structure.
 
-    **Example**
+    Attributes:
+        n_states: order.
+        n_inputs: number of inputs.
+        n_outputs: number of outputs.
+        feedthrough: whether D is free; zero otherwise.
 
-        structure = FreeStructure(n_states=2, n_inputs=1, n_outputs=1)
-        structure.matrices(structure.parameters_of(model))
+    Example:
+        >>> FreeStructure(n_states=1, n_inputs=1, n_outputs=1).parameter_names
+        ('A[0,0]', 'B[0,0]', 'C[0,0]', 'D[0,0]')
     """
 
     n_states: int = eqx.field(static=True)
@@ -98,7 +116,20 @@ class FreeStructure(AbstractStructure):
         return StateSpace(*blocks)
 
     def parameters_of(self, model: StateSpace) -> Parameters:
-        """The entries of a model of the same size, in the order of `parameter_names`."""
+        """The entries of a model of the same size, in the order of `parameter_names`.
+
+        Raises:
+            ValueError: the model is of another size, or in discrete time.
+        """
+        given, wanted = (
+            (model.nx, model.nu, model.ny),
+            (self.n_states, self.n_inputs, self.n_outputs),
+        )
+        if given != wanted or model.is_discrete:
+            raise ValueError(
+                f"model: a continuous-time model with (states, inputs, outputs) = {wanted} is "
+                f"needed, got {given} and dt={model.dt}."
+            )
         blocks = (model.A, model.B, model.C, model.D)[: len(self._shapes())]
         return jnp.concatenate([block.reshape(-1) for block in blocks])
 
@@ -111,23 +142,25 @@ class FreeStructure(AbstractStructure):
 class FunctionStructure(AbstractStructure):
     """A structure from a user's own function ϑ → (A, B, C) or (A, B, C, D).
 
-    **Arguments**
+    Attributes:
+        function: takes ϑ (a vector) and returns three or four matrices (JAX arrays).
+        nominal: a rough guess of ϑ; starts are scattered about it.
+        names: one for each parameter; `parameter 1`, … by default.
+        lower: lower bounds (one number or one for each parameter), minus infinity by default.
+        upper: upper bounds, infinity by default.
+        spread: standard deviation of the starts' logarithms: signs stay, and so does a zero.
 
-    - `function`: takes ϑ (a vector) and returns three or four matrices (JAX arrays).
-    - `nominal`: a rough guess of ϑ; starts are scattered about it.
-    - `names`: one for each parameter; `parameter 1`, … by default.
-    - `lower`, `upper`: bounds, infinite by default.
-    - `spread`: standard deviation of the starts, relative to `nominal` (log-normal factors, so
-      that signs stay).
+    Raises:
+        ValueError: lengths disagree, or a bound excludes `nominal`.
 
-    Raises `ValueError` where lengths disagree or a bound excludes `nominal`.
-
-    **Example**
-
-        pendulum = FunctionStructure(
-            lambda p: (jnp.array([[0.0, 1.0], [-p[0], -p[1]]]), jnp.eye(2)[:, 1:], jnp.eye(2)[:1]),
-            nominal=[9.81, 0.1], names=("stiffness", "damping"),
-        )
+    Example:
+        >>> pendulum = FunctionStructure(
+        ...     lambda p: (jnp.array([[0.0, 1.0], [-p[0], -p[1]]]), jnp.eye(2)[:, 1:], jnp.eye(2)),
+        ...     nominal=[9.81, 0.1],
+        ...     names=("stiffness", "damping"),
+        ... )
+        >>> pendulum.matrices(pendulum.nominal).A[1].tolist()
+        [-9.81, -0.1]
     """
 
     function: Callable[[Parameters], Sequence[Array]] = eqx.field(static=True)
@@ -140,13 +173,16 @@ class FunctionStructure(AbstractStructure):
     def __init__(self, function, *, nominal, names=None, lower=None, upper=None, spread=0.5):
         self.function = function
         self.nominal = jnp.atleast_1d(jnp.asarray(nominal, float))
+        if self.nominal.ndim != 1:
+            raise ValueError(f"nominal: a vector is needed, got shape {self.nominal.shape}.")
         count = self.nominal.shape[0]
         self.names = tuple(names) if names else tuple(f"parameter {i + 1}" for i in range(count))
         if len(self.names) != count:
             raise ValueError(f"names: {len(self.names)} given for {count} parameters in nominal.")
         self.lower = _bound("lower", lower, -jnp.inf, count)
         self.upper = _bound("upper", upper, jnp.inf, count)
-        if not np.all((self.lower <= self.nominal) & (self.nominal <= self.upper)):
+        inside = (self.lower <= self.nominal) & (self.nominal <= self.upper)
+        if not isinstance(inside, Tracer) and not np.all(inside):
             raise ValueError("nominal: lies outside the bounds; move it or widen lower and upper.")
         self.spread = float(spread)
 

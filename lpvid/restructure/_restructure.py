@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from lpvid._results import Status
@@ -20,13 +21,20 @@ _SAME_MINIMUM = 1.02
 class HinfMatching(eqx.Module):
     """How to restructure: least squares on the response, then L-BFGS on smooth surrogates.
 
-    **Arguments**
+    Attributes:
+        frequencies: size of the logarithmic grid (the poles' frequencies are added to it).
+        match_steps: Levenberg–Marquardt steps from each start.
+        log2_powers: exponents of the surrogate, round after round, as powers of two.
+        descent_steps: L-BFGS steps of each round.
+        passes: how often the rounds are gone through, each time with the exact peak added; 0 stops
+            at the least-squares match.
 
-    - `frequencies`: size of the logarithmic grid (the poles' frequencies are added to it).
-    - `match_steps`: Levenberg–Marquardt steps from each start.
-    - `log2_powers`: exponents of the surrogate, round after round, as powers of two.
-    - `descent_steps`: L-BFGS steps of each round.
-    - `passes`: how often the rounds are gone through, each time with the exact peak added.
+    Raises:
+        ValueError: a count is too small, or there is no exponent.
+
+    Example:
+        >>> HinfMatching(passes=0).match_steps
+        80
     """
 
     frequencies: int = eqx.field(static=True, default=60)
@@ -39,19 +47,26 @@ class HinfMatching(eqx.Module):
         for name in ("frequencies", "match_steps", "descent_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: at least 1 is needed, got {getattr(self, name)}.")
+        if self.passes < 0:
+            raise ValueError(f"passes: a number from 0 is needed, got {self.passes}.")
+        if not self.log2_powers or min(self.log2_powers) < 0:
+            raise ValueError(f"log2_powers: numbers from 0 are needed, got {self.log2_powers}.")
 
 
 class Restructured(eqx.Module):
     """A structured model and how sure one can be of it.
 
-    - `parameters`: ϑ, in the order of `structure.parameter_names`.
-    - `model`: the structured `StateSpace` at ϑ, continuous time.
-    - `error_norm`: ‖G(ϑ) − G_i‖∞ (L∞ where a pole is unstable); `cost` is its square, F(ϑ).
-    - `peak_frequency`: where the norm is reached, rad/s.
-    - `match_costs`: least-squares cost that each start ended with, sorted.
-    - `hits`: how many starts ended in the best minimum; `margin`: cost of the next distinct
-      minimum over the best one (infinite where there is none).
-    - `history`: norm before the surrogate stage and after each of its passes.
+    Attributes:
+        structure: the structure it was matched in.
+        parameters: ϑ, in the order of `structure.parameter_names`.
+        error_norm: ‖G(ϑ) − G_i‖∞ (L∞ where a pole is unstable).
+        peak_frequency: where the norm is reached, rad/s.
+        match_costs: least-squares cost that each start ended with, sorted. Where the structure is
+            searched in another parameterisation, these are the starts of its start rule.
+        hits: how many of them ended in the best minimum.
+        margin: cost of the next distinct minimum over the best one (infinite where there is none).
+        history: norm before the surrogate stage and after each of its passes.
+        status: `successful`, or `nonfinite`.
     """
 
     structure: AbstractStructure
@@ -95,32 +110,43 @@ def restructure(
     from the best. The result is a local minimum of a non-convex function: `hits` and `margin`
     tell how the starts agreed.
 
-    **Arguments**
+    Works under `jax.jit` and `jax.vmap` in `black_box` where the structure's start rule does
+    (`ModalStructure`'s does not: it sorts poles eagerly); give `starts=0` and `initial` otherwise.
+    Not meant to be differentiated: use the implicit function theorem on the result.
 
-    - `black_box`: continuous-time model; a discrete one is converted by `d2c` (zero-order hold).
-    - `structure`: what to look for.
-    - `starts`: how many starts the structure's start rule gives; 0 to use `initial` alone.
-    - `key`: random key of the start rule (needed where `starts` > 0).
-    - `initial`: further starting vectors, shape (n_parameters,) or (count, n_parameters), such
-      as a neighbour's solution.
-    - `omega`: match at these frequencies only (rad/s), to the black box's own response there,
-      a discrete one's at e^{jωT}: the right target for band-limited (multisine) records, whose
-      models say nothing about other frequencies. The norm is then the largest singular value
-      on this grid.
-    - `method`: options of the stages.
+    Args:
+        black_box: continuous-time model; a discrete one is converted by `d2c` (zero-order hold).
+        structure: what to look for.
+        starts: how many starts the structure's start rule gives; 0 to use `initial` alone.
+        key: random key of the start rule (needed where `starts` > 0).
+        initial: further starting vectors, shape (n_parameters,) or (count, n_parameters), such
+            as a neighbour's solution.
+        omega: match at these frequencies only (rad/s), to the black box's own response there, a
+            discrete one's at e^{jωT}: the right target for band-limited (multisine) records, whose
+            models say nothing about other frequencies. The norm is then the largest singular value
+            on this grid.
+        method: options of the stages.
 
-    Raises `ValueError` for sizes that do not fit, a missing key, or no start at all. Works
-    under `jax.jit` and `jax.vmap` in `black_box` where the start rule does; not meant to be
-    differentiated (use the implicit function theorem on the result).
+    Returns:
+        The best model found, with what the starts say about it.
 
-    **Example**
+    Raises:
+        ValueError: sizes do not fit, the black box or a start is not finite, the key is missing,
+            there is no start at all, or `omega` exceeds the Nyquist frequency.
 
-        best = restructure(fit.model, structure, starts=24, key=jax.random.key(0))
-        best.parameters, best.cost, best.hits
+    Example:
+        >>> black_box = StateSpace([[-2.0]], [[4.0]], [[0.5]])
+        >>> lag = FunctionStructure(lambda p: (-p[:1, None], p[:1, None], jnp.eye(1)), nominal=1.0)
+        >>> best = restructure(black_box, lag, starts=2, key=jax.random.key(0))
+        >>> best.parameters.round(3).tolist()
+        [2.0]
     """
     method = HinfMatching() if method is None else method
-    continuous = _continuous(black_box)
-    _check_sizes(continuous, structure)
+    _check_black_box(black_box, structure)
+    continuous = black_box
+    if black_box.is_discrete and (starts > 0 or omega is None):
+        continuous = d2c(black_box)
+        _check_finite("black_box", continuous, "no d2c of a pole on the negative real axis")
     highest = np.pi / black_box.dt if black_box.dt > 0 else np.inf
     search = structure.search_structure() or structure
     scattered = None
@@ -151,11 +177,29 @@ def restructure_along(
     """Restructure the local models along κ: each one alone, then again from its neighbours.
 
     A neighbour's solution replaces a point's own where it leads to a lower H∞ error, which mends
-    points whose starts all missed the global minimum. The models must be ordered along κ.
+    points whose starts all missed the global minimum. Not for `jit`: it decides point by point.
 
-    **Example**
+    Args:
+        black_boxes: models ordered along κ.
+        structure: what to look for.
+        starts: how many starts of the structure's start rule, at each point.
+        key: random key of the start rule.
+        omega: see `restructure`; one grid for all points.
+        method: options of the stages.
 
-        local = restructure_along(models, structure, key=jax.random.key(0))
+    Returns:
+        One result for each model. Where a neighbour's solution won, `match_costs` and `hits` are
+        those of the two neighbours.
+
+    Raises:
+        ValueError: as `restructure`.
+
+    Example:
+        >>> black_boxes = [StateSpace([[-p]], [[p]], [[1.0]]) for p in (2.0, 3.0)]
+        >>> lag = FunctionStructure(lambda p: (-p[:1, None], p[:1, None], jnp.eye(1)), nominal=1.0)
+        >>> local = restructure_along(black_boxes, lag, starts=2, key=jax.random.key(0))
+        >>> [round(best.parameters.item(), 3) for best in local]
+        [2.0, 3.0]
     """
     method = HinfMatching() if method is None else method
     keys = jax.random.split(key, len(black_boxes))
@@ -181,7 +225,9 @@ def _run(target, structure, search, scattered, given, method) -> Restructured:
     # Compiled piece by piece: each piece then serves every number and kind of starts, and the
     # norm, dear to compile, is compiled once for all its callers.
     candidates, costs = [], None
-    if scattered is not None:
+    if scattered is not None and search is structure:
+        candidates.append(scattered)
+    elif scattered is not None:
         found = _match(search, scattered, target, method.match_steps)
         costs = found.cost
         best = found.value[jnp.argmin(found.cost)]
@@ -234,11 +280,13 @@ def _descend(structure, start, target, peaks, method):
     )
 
 
-def _continuous(black_box: StateSpace) -> StateSpace:
-    return d2c(black_box) if black_box.dt > 0 else black_box
-
-
-def _check_sizes(black_box: StateSpace, structure: AbstractStructure) -> None:
+def _check_black_box(black_box: StateSpace, structure: AbstractStructure) -> None:
+    if black_box.batch_shape:
+        raise ValueError(
+            f"black_box: one model is needed, got a batch of shape {black_box.batch_shape}; use "
+            "jax.vmap or restructure_along."
+        )
+    _check_finite("black_box", black_box, "look for a failed identification")
     sample = jax.eval_shape(
         structure.matrices, jax.ShapeDtypeStruct((structure.n_parameters,), jnp.float64)
     )
@@ -271,4 +319,11 @@ def _initial(initial: ArrayLike | None, structure: AbstractStructure) -> Array |
             f"initial: vectors of {structure.n_parameters} parameters are needed, got shape "
             f"{vectors.shape}; see structure.parameter_names."
         )
+    _check_finite("initial", vectors, "leave out failed neighbours")
     return vectors
+
+
+def _check_finite(name: str, numbers: StateSpace | Array, advice: str) -> None:
+    for leaf in jax.tree.leaves(numbers):
+        if not isinstance(leaf, Tracer) and not bool(jnp.all(jnp.isfinite(leaf))):
+            raise ValueError(f"{name}: it holds NaN or infinity; {advice}.")

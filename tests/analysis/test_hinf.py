@@ -41,8 +41,8 @@ def test_agrees_with_slicot(nx, nu, ny, dt):
 
 
 @pytest.mark.slow
-# Sampled faster, the slowest modes lie so close to the unit circle that one rounding of A changes the
-# norm by 1e-9.
+# Sampled faster, the slowest modes lie so close to the unit circle that one rounding of A changes
+# the norm by 1e-9.
 @pytest.mark.parametrize("dt", [0.0, 0.1])
 def test_a_thousand_systems(dt):
     rng = np.random.default_rng(8)

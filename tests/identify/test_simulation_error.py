@@ -9,6 +9,7 @@ from lpvid.identify._linear_fit import solve, solve_positive
 from .helpers import prbs, respond, three_modes
 
 recorded = jax.jit(se.record_equations, static_argnames="lengths")
+solved = jax.jit(solve, static_argnames=("nx", "feedthrough"))
 
 
 def arrays(*matrices):
@@ -51,7 +52,7 @@ def test_solution_is_the_least_squares_one(feedthrough):
     rng = np.random.default_rng(3)
     u, y = rng.standard_normal((161, 2)), rng.standard_normal((161, 2))
     equations = recorded(*arrays(A, C, u, y), lengths=lengths)
-    found = solve(equations, nx=6, feedthrough=feedthrough)
+    found = solved(equations, nx=6, feedthrough=feedthrough)
 
     columns = 12 + 4 + 18
     blocks, start = [], 0
@@ -79,7 +80,7 @@ def test_recovers_the_system_that_made_the_data():
     A, B, C, D = three_modes()
     u, x0 = prbs(700, 2), np.arange(6.0)
     y = respond((A, B, C, D), u, x0)
-    found = solve(recorded(*arrays(A, C, u, y), lengths=(700,)), nx=6, feedthrough=True)
+    found = solved(recorded(*arrays(A, C, u, y), lengths=(700,)), nx=6, feedthrough=True)
     for value, truth in ((found.B, B), (found.D, D), (found.x0[0], x0)):
         np.testing.assert_allclose(value, truth, atol=1e-11)
 

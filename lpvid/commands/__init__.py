@@ -1,0 +1,3 @@
+"""The command line's commands: arguments in, library calls, tables and files out."""
+
+from lpvid.commands._main import main as main

@@ -1,0 +1,68 @@
+"""Files that the commands write: checked before the work, written whole after it."""
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lpvid._files import write_atomically
+from lpvid.commands._errors import UsageError
+
+
+def check_targets(targets: dict[str, str | None], sources: Sequence[str] = ()) -> None:
+    """Raise unless every file (option → path) can be written and is none of the sources."""
+    read = {os.path.realpath(source): source for source in sources}
+    taken: dict[str, str] = {}
+    for option, name in targets.items():
+        if name is None:
+            continue
+        path, real = Path(name), os.path.realpath(name)
+        if path.is_dir():
+            raise UsageError(f"{option}: {name} is a folder; name a file in it")
+        if real in read:
+            raise UsageError(f"{option}: {name} is read as data and would be overwritten")
+        if real in taken:
+            raise UsageError(f"{option}: {name} is {taken[real]}'s file too; give two names")
+        taken[real] = option
+        folder = Path(real).parent
+        if not folder.is_dir():
+            raise UsageError(f"{option}: the folder {folder} does not exist; make it first")
+        if not os.access(folder, os.W_OK):
+            raise UsageError(f"{option}: the folder {folder} cannot be written")
+
+
+def make_folder(option: str, name: str) -> Path:
+    """The folder, made where it is missing; raises where files cannot be written in it."""
+    path = Path(name)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise UsageError(f"{option}: {name} is a file; name a folder") from None
+    except OSError as error:
+        raise UsageError(f"{option}: {name} cannot be made ({error.strerror})") from None
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise UsageError(f"{option}: the folder {name} cannot be written")
+    return path
+
+
+def write_json(path: str | os.PathLike[str], content: dict[str, Any]) -> None:
+    """Write figures as JSON; a number that is not finite becomes null."""
+    text = json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    write_atomically(path, text.encode())
+
+
+def plain(value: Any) -> Any:
+    """Arrays as lists, numbers that are not finite as `None`."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return plain(np.asarray(value).tolist())

@@ -1,0 +1,63 @@
+"""Records from the command line's arguments, and how a model is identified from them."""
+
+import argparse
+import os
+from collections.abc import Sequence
+
+from lpvid.commands._errors import UsageError
+from lpvid.data import IOData, Offset, preprocess, read
+from lpvid.identify import AbstractSubspaceMethod, PastInputMOESP, PastOutputMOESP
+
+_METHODS = {"po-moesp": PastOutputMOESP, "pi-moesp": PastInputMOESP}
+
+
+def check_columns(arguments: argparse.Namespace) -> None:
+    """Raise where a column has two parts, or options contradict one another."""
+    parts = [("--input", name) for name in arguments.input]
+    parts += [("--output", name) for name in arguments.output]
+    parts += [("--time", arguments.time)] if arguments.time is not None else []
+    seen: dict[str, str] = {}
+    for option, name in parts:
+        if name in seen:
+            where = f"twice in {option}" if seen[name] == option else f"in {seen[name]} and {option}"
+            raise UsageError(f"the column {name!r} is {where}; give it one part")
+        seen[name] = option
+    if arguments.resample and arguments.time is None:
+        raise UsageError("--resample needs the time column: give --time")
+
+
+def read_records(
+    arguments: argparse.Namespace, files: Sequence[str], scheduling: Sequence[str] = ()
+) -> IOData:
+    """One record from each file, by the columns and the clock of the arguments."""
+    for file in files:
+        if not os.path.exists(file):
+            raise UsageError(f"{file}: no such file; check the path and the working folder")
+    return read(
+        list(files),
+        inputs=arguments.input,
+        outputs=arguments.output,
+        scheduling=list(scheduling),
+        time=arguments.time,
+        dt=arguments.dt,
+        resample=arguments.resample,
+    )
+
+
+def without_offsets(
+    arguments: argparse.Namespace, data: IOData, *others: IOData
+) -> tuple[Offset | None, list[IOData]]:
+    """`data` and others, both freed of the means of `data`, unless offsets are to be kept."""
+    if arguments.keep_offsets:
+        return None, [data, *others]
+    offset = Offset.mean_of(data)
+    return offset, [preprocess(part, offset)[0] for part in (data, *others)]
+
+
+def make_method(arguments: argparse.Namespace) -> AbstractSubspaceMethod:
+    """The method of identification that the arguments describe."""
+    return _METHODS[arguments.method](
+        order=arguments.order,
+        block_rows=arguments.block_rows,
+        stabilise=False if arguments.stabilise is None else arguments.stabilise,
+    )
