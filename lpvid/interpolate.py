@@ -27,10 +27,10 @@ Points = Float[Array, "point scheduling"]
 
 def interpolate(
     models: Sequence[Restructured] | Sequence[StateSpace],
-    kappas: ArrayLike,
+    kappas: ArrayLike | Sequence,
     method: Polynomial | None = None,
     *,
-    weights: ArrayLike | None = None,
+    weights: ArrayLike | Sequence | None = None,
 ) -> LPVStateSpace:
     """One LPV model through local ones, by least squares on their parameters (equation 35).
 
@@ -81,10 +81,10 @@ def interpolate(
 
 def leave_one_out(
     models: Sequence[Restructured] | Sequence[StateSpace],
-    kappas: ArrayLike,
+    kappas: ArrayLike | Sequence,
     *,
     highest: int = 5,
-    weights: ArrayLike | None = None,
+    weights: ArrayLike | Sequence | None = None,
 ) -> dict[int, float]:
     """Error of predicting each point from the others, for each polynomial degree.
 
@@ -162,7 +162,7 @@ def _response_at(structure: AbstractStructure, parameters: Array, omega: Array):
 
 
 def interpolate_balanced(
-    models: Sequence[StateSpace], kappas: ArrayLike, method: Polynomial | None = None
+    models: Sequence[StateSpace], kappas: ArrayLike | Sequence, method: Polynomial | None = None
 ) -> LPVStateSpace:
     """The naive way: balance each black box, match signs along κ, interpolate entry by entry.
 
@@ -190,7 +190,9 @@ def interpolate_balanced(
 
 
 def interpolation_fit(
-    lpv: LPVStateSpace, models: Sequence[Restructured] | Sequence[StateSpace], kappas: ArrayLike
+    lpv: LPVStateSpace,
+    models: Sequence[Restructured] | Sequence[StateSpace],
+    kappas: ArrayLike | Sequence,
 ) -> Float[Array, ""]:
     """FIT of the interpolated entries of A and B to the local models' (001, equation 36), percent.
 
@@ -230,7 +232,7 @@ def _same_signs(model: StateSpace, neighbour: StateSpace) -> StateSpace:
     )
 
 
-def _points(kappas: ArrayLike, count: int) -> Points:
+def _points(kappas: ArrayLike | Sequence, count: int) -> Points:
     points = jnp.asarray(kappas, float)
     points = points[:, None] if points.ndim == 1 else points
     if points.ndim != 2 or points.shape[0] != count:
@@ -240,7 +242,7 @@ def _points(kappas: ArrayLike, count: int) -> Points:
     return points
 
 
-def _weights(weights: ArrayLike | None, count: int) -> Float[Array, " point"]:
+def _weights(weights: ArrayLike | Sequence | None, count: int) -> Float[Array, " point"]:
     values = jnp.ones(count) if weights is None else jnp.asarray(weights, float)
     known = not isinstance(values, Tracer)
     if values.shape != (count,) or (known and not bool(jnp.all(values > 0))):

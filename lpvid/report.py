@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from lpvid._files import write_atomically
-from lpvid.plot._figure import png_bytes
+from lpvid.plot import png_bytes
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 

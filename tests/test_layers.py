@@ -43,8 +43,10 @@ def imports(module: Path, *, top_level: bool = False) -> set[str]:
 
 
 def _outside_functions(node):
+    """What runs on import: neither bodies of functions nor what type checkers alone read."""
     for child in ast.iter_child_nodes(node):
-        if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+        typing_only = isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING"
+        if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) and not typing_only:
             yield child
             yield from _outside_functions(child)
 

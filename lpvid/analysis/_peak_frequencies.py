@@ -55,7 +55,7 @@ def peak_frequencies(
         >>> system = StateSpace([[0.0, 1.0], [-1.0, -0.02]], [[0.0], [1.0]], [[1.0, 0.0]])
         >>> omega, gain = peak_frequencies(system, 1)
         >>> round(float(omega[0]), 4), round(float(gain[0]), 4)
-        (0.9998, 50.0025)
+        (0.9999, 50.0025)
     """
     if count < 1:
         raise ValueError(f"count must be at least 1, got {count}.")

@@ -27,10 +27,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         >>> main(["identify", "run.csv"])  # doctest: +SKIP
         2
     """
-    command = "lpvid"
+    words = list(sys.argv[1:] if argv is None else argv)
+    command = " ".join(["lpvid", *(word for word in words[:1] if not word.startswith("-"))])
     try:
-        arguments = make_parser().parse_args(protect_numbers(sys.argv[1:] if argv is None else argv))
-        command = f"lpvid {arguments.command}"
+        arguments = make_parser().parse_args(protect_numbers(words))
         with Warnings(command) as warnings:
             _run(arguments, warnings)
         sys.stdout.flush()

@@ -146,18 +146,18 @@ def identify(
     result = complete(windows=data.lengths)
     if not traced and float(result["spectral_radius"]) > 1.0 + _STABILITY_MARGIN:
         result = _free_unstable(result, complete, data.lengths, 2 * block_rows)
-    found = {name: found[name] for name in _RANGE_STATS}
-    fit = _as_fit(result, found | dict(reflections=jnp.asarray(route == "qr")), data)
-    if not traced and fit.status != Status.successful:
+    # Read off one number rather than the status: a comparison of those is a computation.
+    well = result.pop("successful")
+    fit = _as_fit(result | {name: found[name] for name in _RANGE_STATS}, data)
+    if not traced and not bool(well):
         _report(fit, data, block_rows, negligible(route), throw)
     return fit
 
 
-_RANGE_STATS = ("singular_values", "smallest_pivot", "excitation_rank")
+_RANGE_STATS = ("singular_values", "smallest_pivot", "excitation_rank", "reflections")
 
 
-def _as_fit(result: dict[str, Any], found: dict[str, Any], data: IOData) -> Fit:
-    stats = found | result
+def _as_fit(stats: dict[str, Any], data: IOData) -> Fit:
     A, B, C, D = (stats.pop(name) for name in "ABCD")
     model = StateSpace(A, B, C, D, data.dt)
     return Fit(
@@ -196,6 +196,7 @@ def _range(u, y, *, method, block_rows, lengths, route):
         scale=scale,
         smallest_pivot=conditioning.smallest_pivot,
         excitation_rank=conditioning.excitation_rank,
+        reflections=jnp.asarray(route == "qr"),
     )
 
 
@@ -233,6 +234,7 @@ def _complete(found, u, y, rounding, *, order, full_rank, feedthrough, stabilise
         D=D,
         x0=linear.x0,
         status=status,
+        successful=status == Status.successful,
         spectral_radius=radius,
         eigenvalues_moved=moved,
         residual_std=jnp.sqrt(linear.residual / sum(windows)) * scale[nu:],

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from lpvid.models._convert import c2d
 from lpvid.models._scheduling import PolynomialBasis
 from lpvid.models._simulate import simulate_time_varying
-from lpvid.models._state_space import StateSpace
+from lpvid.models._state_space import Numbers, StateSpace
 from lpvid.models._structures import AbstractStructure
 
 
@@ -53,11 +53,11 @@ class LPVStateSpace(eqx.Module):
         """Number of scheduling variables."""
         return self.kappa_low.shape[0]
 
-    def parameters(self, kappa: ArrayLike) -> Float[Array, "*batch parameter"]:
+    def parameters(self, kappa: Numbers) -> Float[Array, "*batch parameter"]:
         """ϑ(κ) for κ of shape (…, n_scheduling); a scalar κ may be given plainly."""
         return self.basis(self._schedule(kappa)) @ self.coefficients
 
-    def at(self, kappa: ArrayLike) -> StateSpace:
+    def at(self, kappa: Numbers) -> StateSpace:
         """The continuous-time model frozen at one value of κ; warns outside its range.
 
         Raises:
@@ -72,7 +72,7 @@ class LPVStateSpace(eqx.Module):
         self._warn_outside(point)
         return self.structure.matrices(self.parameters(point))
 
-    def is_inside(self, kappa: ArrayLike) -> Array:
+    def is_inside(self, kappa: Numbers) -> Array:
         """Whether κ (…, n_scheduling) lies within the box of the points it was built from."""
         point = self._schedule(kappa)
         # A hair outside, as of a measured schedule at the end of its range, is no extrapolation.
@@ -82,7 +82,7 @@ class LPVStateSpace(eqx.Module):
         return jnp.all(((point - low) >= 0) & ((high - point) >= 0), axis=-1)
 
     def simulate(
-        self, *, u: ArrayLike, kappa: ArrayLike, dt: float, x0: ArrayLike | None = None
+        self, *, u: Numbers, kappa: Numbers, dt: float, x0: Numbers | None = None
     ) -> Float[Array, "time output"]:
         """Response to an input along a schedule.
 
@@ -120,10 +120,12 @@ class LPVStateSpace(eqx.Module):
             raise ValueError(f"u: {frozen.nu} inputs are needed, got {u.shape[1]} columns.")
         # Batched, not vmapped: so the matrix exponential skips the squarings that no sample needs.
         discrete = c2d(frozen, dt)
-        start = jnp.zeros(discrete.A.shape[-1]) if x0 is None else jnp.asarray(x0, float)
+        start = jnp.zeros(frozen.nx) if x0 is None else jnp.asarray(x0, float)
+        if start.shape != (frozen.nx,):
+            raise ValueError(f"x0: {frozen.nx} states are needed, got shape {start.shape}.")
         return simulate_time_varying(discrete.A, discrete.B, discrete.C, discrete.D, u=u, x0=start)
 
-    def _schedule(self, kappa: ArrayLike) -> Array:
+    def _schedule(self, kappa: Numbers) -> Array:
         """κ with a last axis of n_scheduling; a missing axis is added where that is no guess."""
         point = jnp.asarray(kappa, float)
         if self.n_scheduling == 1 and (point.ndim == 0 or point.shape[-1] != 1):

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from lpvid.models._state_space import StateSpace
 from lpvid.models._structures import AbstractStructure, Parameters, Starts
@@ -72,15 +72,24 @@ class MechanicalStructure(AbstractStructure):
         factor = diagonal[:, None] * (jnp.tril(factor, -1) + jnp.eye(self.n_degrees))
         return factor @ factor.T
 
-    def parameters_of(self, mass: Array, damping: Array, stiffness: Array) -> Parameters:
+    def parameters_of(
+        self, mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike
+    ) -> Parameters:
         """ϑ of given symmetric positive definite matrices, each (n_degrees, n_degrees).
 
         Raises:
-            ValueError: a matrix is not positive definite (checked outside `jit` only).
+            ValueError: a matrix has the wrong shape, or is not positive definite (checked outside
+                `jit` only).
         """
         parts = []
         for name, matrix in (("mass", mass), ("damping", damping), ("stiffness", stiffness)):
-            factor = jnp.linalg.cholesky(jnp.asarray(matrix, float))
+            matrix = jnp.asarray(matrix, float)
+            if matrix.shape != (self.n_degrees, self.n_degrees):
+                raise ValueError(
+                    f"{name}: shape {(self.n_degrees, self.n_degrees)} is needed, got "
+                    f"{matrix.shape}."
+                )
+            factor = jnp.linalg.cholesky(matrix)
             if not isinstance(factor, Tracer) and not bool(jnp.all(jnp.isfinite(factor))):
                 raise ValueError(f"{name}: it is not positive definite, which the structure is.")
             diagonal = jnp.diag(factor)

@@ -5,7 +5,9 @@ import itertools
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
+
+from lpvid.models._state_space import Numbers
 
 
 class Polynomial(eqx.Module):
@@ -51,7 +53,7 @@ class PolynomialBasis(eqx.Module):
         """Number of basis functions."""
         return len(self.exponents)
 
-    def __call__(self, kappa: ArrayLike) -> Float[Array, "*batch basis"]:
+    def __call__(self, kappa: Numbers) -> Float[Array, "*batch basis"]:
         """Values of all basis functions at κ, shape (…, n_scheduling) → (…, size)."""
         kappa = jnp.asarray(kappa, float)
         centre = jnp.broadcast_to(self.centre, kappa.shape)
@@ -66,7 +68,7 @@ class PolynomialBasis(eqx.Module):
         return jnp.stack(columns, axis=-1)
 
 
-def polynomial_basis(kappas: ArrayLike, degree: int) -> PolynomialBasis:
+def polynomial_basis(kappas: Numbers, degree: int) -> PolynomialBasis:
     """The polynomial basis up to a total degree, centred on given points.
 
     Args:

@@ -4,6 +4,7 @@ Every function takes `axes=` (draw there; new ones are made otherwise) and retur
 drew on. Matplotlib is imported when the first plot is drawn, not with lpvid.
 """
 
+from lpvid.plot._figure import png_bytes as png_bytes
 from lpvid.plot._figure import save_figure as save_figure
 from lpvid.plot._frequency import bode as bode
 from lpvid.plot._frequency import singular_values as singular_values

@@ -99,8 +99,8 @@ def restructure(
     *,
     starts: int = 24,
     key: PRNGKeyArray | None = None,
-    initial: ArrayLike | None = None,
-    omega: ArrayLike | None = None,
+    initial: ArrayLike | Sequence | None = None,
+    omega: ArrayLike | Sequence | None = None,
     method: HinfMatching | None = None,
 ) -> Restructured:
     """Find ϑ that minimises F(ϑ) = ‖G(s, ϑ) − G_i(s)‖∞² (001, equation 6).
@@ -171,7 +171,7 @@ def restructure_along(
     *,
     starts: int = 24,
     key: PRNGKeyArray,
-    omega: ArrayLike | None = None,
+    omega: ArrayLike | Sequence | None = None,
     method: HinfMatching | None = None,
 ) -> list[Restructured]:
     """Restructure the local models along κ: each one alone, then again from its neighbours.
@@ -299,7 +299,7 @@ def _check_black_box(black_box: StateSpace, structure: AbstractStructure) -> Non
         )
 
 
-def _grid(omega: ArrayLike, highest: float) -> Float[Array, " frequency"]:
+def _grid(omega: ArrayLike | Sequence, highest: float) -> Float[Array, " frequency"]:
     grid = jnp.atleast_1d(jnp.asarray(omega, float))
     if grid.ndim != 1 or not bool(jnp.all((grid >= 0) & (grid <= highest * (1 + 1e-9)))):
         raise ValueError(
@@ -309,7 +309,7 @@ def _grid(omega: ArrayLike, highest: float) -> Float[Array, " frequency"]:
     return grid
 
 
-def _initial(initial: ArrayLike | None, structure: AbstractStructure) -> Array | None:
+def _initial(initial: ArrayLike | Sequence | None, structure: AbstractStructure) -> Array | None:
     if initial is None:
         return None
     vectors = jnp.asarray(initial, float)
