@@ -22,7 +22,7 @@ from lpvid.models import (
 )
 from lpvid.restructure import Restructured
 
-Points = Float[Array, "point scheduling"]
+Points = Float[np.ndarray, "point scheduling"]
 
 
 def interpolate(
@@ -74,8 +74,8 @@ def interpolate(
         structure=structure,
         basis=basis,
         coefficients=coefficients,
-        kappa_low=jnp.min(points, axis=0),
-        kappa_high=jnp.max(points, axis=0),
+        kappa_low=jnp.asarray(points.min(axis=0)),
+        kappa_high=jnp.asarray(points.max(axis=0)),
     )
 
 
@@ -119,7 +119,7 @@ def leave_one_out(
     errors: dict[int, float] = {}
     for degree in range(highest + 1):
         basis = polynomial_basis(points, degree)
-        if basis.size > len(models) - 1:
+        if not all(_determines(basis, np.delete(points, out, axis=0)) for out in tried):
             break
         predicted = []
         for out in tried:
@@ -233,7 +233,8 @@ def _same_signs(model: StateSpace, neighbour: StateSpace) -> StateSpace:
 
 
 def _points(kappas: ArrayLike | Sequence, count: int) -> Points:
-    points = jnp.asarray(kappas, float)
+    # NumPy: which polynomials the points determine must be known, inside of jit too.
+    points = np.asarray(kappas, float)
     points = points[:, None] if points.ndim == 1 else points
     if points.ndim != 2 or points.shape[0] != count:
         raise ValueError(
@@ -251,9 +252,11 @@ def _weights(weights: ArrayLike | Sequence | None, count: int) -> Float[Array, "
 
 
 def _basis(points: Points, degree: int) -> PolynomialBasis:
-    basis = polynomial_basis(points, degree)
-    if not _determines(basis, points):
-        distinct = np.unique(np.asarray(points), axis=0).shape[0]
+    with jax.ensure_compile_time_eval():
+        basis = polynomial_basis(points, degree)
+        determined = _determines(basis, points)
+    if not determined:
+        distinct = np.unique(points, axis=0).shape[0]
         raise ValueError(
             f"degree: {degree} needs {basis.size} distinct points, not all on a curve of this "
             f"degree, in {points.shape[1]} scheduling variable(s), {distinct} given; lower it or "

@@ -4,6 +4,7 @@ import hashlib
 import os
 import platform
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -16,7 +17,8 @@ def keep_compiled_code() -> Path | None:
     `LPVID_NO_CACHE=1`, a cache configured already, or a folder that cannot be written leave all as
     it is: a cache saves time and is never a reason to fail.
     """
-    if os.environ.get(_OPT_OUT, "0") not in ("", "0") or jax.config.jax_compilation_cache_dir:
+    configured: Any = jax.config
+    if os.environ.get(_OPT_OUT, "0") not in ("", "0") or configured.jax_compilation_cache_dir:
         return None
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     folder = Path(base) / "lpvid" / f"jax-{jax.__version__}-{_processor()}"

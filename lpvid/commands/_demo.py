@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 import jax
+import matplotlib
 import numpy as np
 from tqdm import tqdm
 
@@ -28,6 +29,8 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
     started = time.perf_counter()
     folder = make_folder("--out", arguments.out)
     keep_compiled_code()
+    # Pictures go to files: no window, no display needed.
+    matplotlib.use("Agg")
     with _Progress(_STAGES + 1) as progress:
         result = run_study(
             jax.random.key(arguments.seed), runs=arguments.runs, report=progress.begin

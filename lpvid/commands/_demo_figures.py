@@ -13,7 +13,7 @@ from lpvid.study import MODEL_NAMES, StudyResult
 # Samples drawn of a record: more would be a black band.
 _SHOWN = 400
 # Room beside the measured range that a model may use before it is cut.
-_ROOM = 0.6
+_ROOM = 0.8
 
 
 class Figure(NamedTuple):
@@ -123,7 +123,8 @@ FIGURES = (
     ),
     Figure(
         "local_response",
-        "Local models against the arm on a noise-free validation record, same posture.",
+        "Local models against the arm at the same posture, on the beginning of a noise-free "
+        "validation record; the fits are those of the samples shown.",
         _local_response,
     ),
     Figure(

@@ -1,4 +1,4 @@
-"""The demo's tables, beside the figures that 001 published for its own arm."""
+"""The demo's tables, beside the figures that the paper (001) published for its own arm."""
 
 import dataclasses
 from typing import Any
@@ -12,10 +12,10 @@ SETTING = (
     "of the second joint the arm is excited about rest, noise is added to the measured joint "
     "velocities (30 dB), and black boxes of order 6 are identified from each record by PI-MOESP. "
     "The average black box of each posture is rewritten in the structure that physics gives "
-    "(“restructured”) by minimising the H∞ norm of the difference, and its entries are interpolated "
-    "by polynomials in κ = cos θ2. The model so found is compared with the exact linearisations "
-    "interpolated in the same way (“analytic”) and with black boxes interpolated entry by entry in "
-    "balanced coordinates (“balanced”).\n\n"
+    "(“restructured”) by minimising the H∞ norm of the difference, and its entries are "
+    "interpolated by polynomials in κ = cos θ2. The model so found is compared with the exact "
+    "linearisations interpolated in the same way (“analytic”) and with black boxes interpolated "
+    "entry by entry in balanced coordinates (“balanced”).\n\n"
     "The published figures stand beside ours. Their arm has other physical constants and their "
     "records are not public, so they show what to expect, not what to match."
 )
@@ -89,7 +89,11 @@ def _local(result: StudyResult) -> Table:
         "The average black box of each posture, simulated from rest on a noise-free record with "
         "another excitation.",
         "Table 1. Local black boxes on validation records, percent",
-        ["θ2", "BFT y1", "BFT y2", "001 y1", "001 y2", "VAF y1", "VAF y2", "001 y1", "001 y2"],
+        [
+            "θ2",
+            *("BFT y1", "BFT y2", "paper y1", "paper y2"),
+            *("VAF y1", "VAF y2", "paper y1", "paper y2"),
+        ],
         rows,
         ("records", "local_response", "bode"),
     )
@@ -118,7 +122,7 @@ def _cost(result: StudyResult) -> Table:
         "F = ‖G(ϑ) − G‖∞² over ‖G analytic‖∞, with how many of the starts ended in the best "
         "minimum, and how many times dearer the next distinct minimum is.",
         "Table 2. Relative cost of restructuring",
-        ["θ2", "F / ‖G‖∞", "001", "hits", "starts", "margin"],
+        ["θ2", "F / ‖G‖∞", "paper", "hits", "starts", "margin"],
         rows,
         ("minima", "poles"),
     )
@@ -132,10 +136,11 @@ def _fit(result: StudyResult) -> Table:
             rows.append([name, degree, float(fit), *published])
     return Table(
         "Interpolation",
-        "FIT of the polynomials in κ to the local models' entries of A and B together; 001 gives "
-        "A and B apart. An entrywise fit says little about a model: compare with table 4.",
+        "FIT of the polynomials in κ to the local models' entries of A and B together; the "
+        "paper gives A and B apart. An entrywise fit says little about a model: "
+        "compare with table 4.",
         "Table 3. Fit of the interpolated entries, percent",
-        ["model", "degree", "FIT", "001 A", "001 B"],
+        ["model", "degree", "FIT", "paper A", "paper B"],
         rows,
         ("parameters", "modes"),
     )
@@ -152,7 +157,7 @@ def _sweep(result: StudyResult) -> Table:
         "A noise-free record of the nonlinear arm in which θ2 crosses its whole range, against the "
         "three interpolated models, all simulated from rest.",
         "Table 4. The interpolated models along the sweep, percent",
-        ["model", "output", "BFT", "001", "VAF", "001"],
+        ["model", "output", "BFT", "paper", "VAF", "paper"],
         rows,
         ("sweep",),
     )

@@ -11,7 +11,7 @@ from lpvid import __version__
 from lpvid._results import Status
 from lpvid.commands._cache import keep_compiled_code
 from lpvid.commands._messages import Warnings
-from lpvid.commands._output import check_targets, write_json
+from lpvid.commands._output import check_targets, plain, write_json
 from lpvid.commands._records import check_columns, make_method, read_records, without_offsets
 from lpvid.identify import Fit, identify, simulation_fit
 from lpvid.io import save
@@ -98,15 +98,17 @@ def _print(
     if offsets_removed:
         print("Offsets: each channel's mean over the fitted part was taken out of both parts.")
     state = "stable" if stable else "UNSTABLE"
-    print(f"Order {fit.order}, {arguments.method}, {state}. {Status[fit.status]}\n")
+    print(f"Order {fit.order}, {arguments.method}, {state}.\n")
     rows = [
-        (pole["frequency_hz"], pole["damping"], complex(pole["re"], pole["im"]))
+        (pole["frequency_hz"], pole["damping"], f"{pole['re']:.6f} + {pole['im']:.6f}j")
         for pole in poles_of(fit.model)
         if pole["im"] >= 0.0
     ]
     print(text_table(rows, ["frequency (Hz)", "damping", "pole (z)"]) + "\n")
     table = [
-        (name, float(train), float(test))
-        for name, train, test in zip(outputs, scores["train"], scores["test"], strict=True)
+        (name, train, test)
+        for name, train, test in zip(
+            outputs, plain(scores["train"]), plain(scores["test"]), strict=True
+        )
     ]
     print(text_table(table, ["output", "BFT fitted (%)", "BFT rest (%)"]))

@@ -16,7 +16,7 @@ from lpvid.commands._cache import keep_compiled_code
 from lpvid.commands._errors import UsageError
 from lpvid.commands._identify import poles_of
 from lpvid.commands._messages import Warnings, say
-from lpvid.commands._output import check_targets, write_json
+from lpvid.commands._output import check_targets, plain, write_json
 from lpvid.commands._records import check_columns, make_method, read_records, without_offsets
 from lpvid.data import IOData, join
 from lpvid.identify import Fit, identify, simulation_fit
@@ -292,15 +292,17 @@ def _print(arguments: argparse.Namespace, content: dict[str, Any], names: list[s
         print("Offsets: each channel's mean over each record, tests too, was taken out.")
     rows = []
     for name, point in zip(names, content["points"], strict=True):
+        # One error for all outputs together; black boxes are not restructured.
+        error = 100.0 * point["relative_error"] if "relative_error" in point else None
         for k, output in enumerate(content["outputs"]):
             first = k == 0
             rows.append(
                 (
                     name if first else "",
                     output,
-                    float(point["fit"][k]),
-                    float(point["fit_lpv"][k]),
-                    100.0 * point["relative_error"] if first and "relative_error" in point else None,
+                    plain(point["fit"][k]),
+                    plain(point["fit_lpv"][k]),
+                    error if first else None,
                     ("yes" if point["stable"] else "NO") if first else "",
                 )
             )
@@ -314,8 +316,8 @@ def _print(arguments: argparse.Namespace, content: dict[str, Any], names: list[s
         for test in content["test"]:
             asked = test["kappa"] if isinstance(test["kappa"], str) else _written(test["kappa"])
             for k, output in enumerate(content["outputs"]):
-                local = [float(fit[k]) for fit in test["local"].values()]
-                rows.append((asked if k == 0 else "", output, float(test["lpv"][k]), *local))
+                local = [plain(fit[k]) for fit in test["local"].values()]
+                rows.append((asked if k == 0 else "", output, plain(test["lpv"][k]), *local))
         headers = ["test K", "output", "LPV", *(f"local {name}" for name in names)]
         print("\nBFT (%) on the test records, initial states estimated:\n")
         print(text_table(rows, headers))

@@ -4,7 +4,6 @@ import re
 import sys
 import types
 import warnings
-from typing import Self
 
 # The library speaks of its arguments; here they are options.
 _WORDS = (
@@ -43,7 +42,7 @@ class Warnings:
         self._command = command
         self._catcher = warnings.catch_warnings()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Warnings":
         self._catcher.__enter__()
         warnings.resetwarnings()
         # What libraries say to programmers is none of the user's business.
@@ -61,8 +60,7 @@ class Warnings:
         error: BaseException | None,
         trace: types.TracebackType | None,
     ) -> None:
-        del kind, error, trace
-        self._catcher.__exit__()
+        self._catcher.__exit__(kind, error, trace)
 
     def _show(self, message, category, filename, lineno, file=None, line=None) -> None:
         del category, filename, lineno, file, line

@@ -34,7 +34,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="lpvid",
         description="System identification and linear parameter-varying (LPV) modelling.",
-        epilog="LPVID_NO_CACHE=1 keeps no compiled code between runs; LPVID_DEBUG=1 shows tracebacks.",
+        epilog="LPVID_NO_CACHE=1 keeps no compiled code between runs; LPVID_DEBUG=1 shows "
+        "tracebacks.",
     )
     parser.add_argument("--version", action="version", version=f"lpvid {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -143,9 +144,7 @@ def _add_columns(parser) -> None:
         metavar="COL,…",
         help="input columns: names, or numbers from 1 in a table without header",
     )
-    parser.add_argument(
-        "--output", type=_columns, action="extend", required=True, metavar="COL,…"
-    )
+    parser.add_argument("--output", type=_columns, action="extend", required=True, metavar="COL,…")
     clock = parser.add_mutually_exclusive_group(required=True)
     clock.add_argument("--dt", type=_seconds, metavar="S", help="sample time in seconds")
     clock.add_argument("--time", metavar="COL", help="time column in seconds")

@@ -19,7 +19,9 @@ def check_columns(arguments: argparse.Namespace) -> None:
     seen: dict[str, str] = {}
     for option, name in parts:
         if name in seen:
-            where = f"twice in {option}" if seen[name] == option else f"in {seen[name]} and {option}"
+            where = (
+                f"twice in {option}" if seen[name] == option else f"in {seen[name]} and {option}"
+            )
             raise UsageError(f"the column {name!r} is {where}; give it one part")
         seen[name] = option
     if arguments.resample and arguments.time is None:

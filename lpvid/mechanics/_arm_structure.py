@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from lpvid.models import AbstractStructure, StateSpace
@@ -57,7 +58,7 @@ class TwoLinkArmStructure(AbstractStructure):
         """The dissipative form, in which every parameter value is a stable model."""
         return DissipativeTwoLinkArm(self.lengths, self.scales)
 
-    def from_search(self, parameters: Parameters) -> Parameters:
+    def from_search(self, parameters: Float[Array, "14"]) -> Float[Array, "16"]:
         """ϑ1..16 of a point of the dissipative form."""
         return self.search_structure().entries(parameters)
 
@@ -128,6 +129,7 @@ class DissipativeTwoLinkArm(AbstractStructure):
         """The model at these parameters."""
         return TwoLinkArmStructure(self.lengths).matrices(self.entries(parameters))
 
+    @eqx.filter_jit
     def starts(
         self, key: PRNGKeyArray, count: int, black_box: StateSpace
     ) -> Float[Array, "start parameter"]:
@@ -200,6 +202,7 @@ def two_link_arm_structure(
 
 def _positive(name: str, value: ArrayLike, count: int) -> Array:
     array = jnp.asarray(value, float)
-    if array.shape != (count,) or not bool(jnp.all(array > 0)):
+    known = not isinstance(array, Tracer)
+    if array.shape != (count,) or (known and not bool(jnp.all(array > 0))):
         raise ValueError(f"scales: {name} must hold {count} positive numbers, got {value}.")
     return array

@@ -69,7 +69,7 @@ class AbstractStructure(eqx.Module):
         """A better-behaved parameterisation to search in first (None: search in this one)."""
         return None
 
-    def from_search(self, parameters: Parameters) -> Parameters:
+    def from_search(self, parameters: Float[Array, " searched"]) -> Parameters:
         """Carry the parameters found in `search_structure()` over to this structure."""
         return parameters
 

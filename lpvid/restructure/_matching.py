@@ -24,6 +24,7 @@ class Target(eqx.Module):
     black_box: StateSpace | None
 
 
+@eqx.filter_jit
 def make_target(black_box: StateSpace, n_frequencies: int, highest: float) -> Target:
     """Grid of log-spaced frequencies over the poles' range, with the poles' own frequencies.
 
@@ -80,8 +81,8 @@ def match_responses(
     scale = weights[None] / np.sqrt(target.response.size)
 
     def residual(free):
-        error = response_error(structure, bounds.bounded(free), target) * scale
-        return jnp.concatenate([jnp.real(error).reshape(-1), jnp.imag(error).reshape(-1)])
+        error = response_error(structure, bounds.bounded(free), target)
+        return jnp.stack([jnp.real(error) * scale, jnp.imag(error) * scale])
 
     found = least_squares(residual, bounds.free(start), max_steps=max_steps)
     return eqx.tree_at(lambda s: s.value, found, bounds.bounded(found.value))

@@ -146,7 +146,6 @@ def restructure(
     continuous = black_box
     if black_box.is_discrete and (starts > 0 or omega is None):
         continuous = d2c(black_box)
-        _check_finite("black_box", continuous, "no d2c of a pole on the negative real axis")
     highest = np.pi / black_box.dt if black_box.dt > 0 else np.inf
     search = structure.search_structure() or structure
     scattered = None
@@ -230,8 +229,9 @@ def _run(target, structure, search, scattered, given, method) -> Restructured:
     elif scattered is not None:
         found = _match(search, scattered, target, method.match_steps)
         costs = found.cost
-        best = found.value[jnp.argmin(found.cost)]
-        candidates.append(structure.from_search(best)[None])
+        # Two, as many as a point has neighbours: one compilation serves both kinds of start.
+        best = found.value[jnp.argsort(found.cost)[:2]]
+        candidates.append(jax.vmap(structure.from_search)(best))
     if given is not None:
         candidates.append(given)
     matched = _match(structure, jnp.concatenate(candidates), target, method.match_steps)
@@ -300,13 +300,13 @@ def _check_black_box(black_box: StateSpace, structure: AbstractStructure) -> Non
 
 
 def _grid(omega: ArrayLike | Sequence, highest: float) -> Float[Array, " frequency"]:
-    grid = jnp.atleast_1d(jnp.asarray(omega, float))
-    if grid.ndim != 1 or not bool(jnp.all((grid >= 0) & (grid <= highest * (1 + 1e-9)))):
+    grid = np.atleast_1d(np.asarray(omega, float))
+    if grid.ndim != 1 or not np.all((grid >= 0) & (grid <= highest * (1 + 1e-9))):
         raise ValueError(
             f"omega: frequencies from 0 to the Nyquist frequency ({highest:.4g} rad/s) are needed "
             "in a one-dimensional array."
         )
-    return grid
+    return jnp.asarray(grid)
 
 
 def _initial(initial: ArrayLike | Sequence | None, structure: AbstractStructure) -> Array | None:
@@ -325,5 +325,6 @@ def _initial(initial: ArrayLike | Sequence | None, structure: AbstractStructure)
 
 def _check_finite(name: str, numbers: StateSpace | Array, advice: str) -> None:
     for leaf in jax.tree.leaves(numbers):
-        if not isinstance(leaf, Tracer) and not bool(jnp.all(jnp.isfinite(leaf))):
+        # NumPy, so that constants can also be checked inside of jit.
+        if not isinstance(leaf, Tracer) and not np.all(np.isfinite(leaf)):
             raise ValueError(f"{name}: it holds NaN or infinity; {advice}.")

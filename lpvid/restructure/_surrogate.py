@@ -32,11 +32,11 @@ def power_norm(error: Array, log2_power: Array, most: int) -> Float[Array, ""]:
     """
     if error.shape[-1] > error.shape[-2]:
         error = jnp.swapaxes(error, -1, -2)
-    gram = jnp.conj(jnp.swapaxes(error, -1, -2)) @ error
-    trace = jnp.real(jnp.trace(gram, axis1=-2, axis2=-1))
     # The norm is homogeneous: dividing by a constant first keeps the powers within range.
-    scale = jax.lax.stop_gradient(jnp.max(trace)) + jnp.finfo(float).tiny
-    power = gram / scale
+    square = jnp.real(error) ** 2 + jnp.imag(error) ** 2
+    scale = jax.lax.stop_gradient(jnp.max(jnp.sum(square, axis=(-2, -1)))) + jnp.finfo(float).tiny
+    error = error / jnp.sqrt(scale).astype(error.dtype)
+    power = jnp.conj(jnp.swapaxes(error, -1, -2)) @ error
     for step in range(most):
         power = jnp.where(step < log2_power, power @ power, power)
     total = jnp.sum(jnp.real(jnp.trace(power, axis1=-2, axis2=-1)))

@@ -102,7 +102,6 @@ def test_starts_lie_around_the_plant(scales):
     ("options", "message"),
     [
         ({"lengths": (0.35, 0.0)}, "lengths: two positive"),
-        ({"lengths": (0.35,)}, "lengths: two positive"),
         ({"scales": SCALES._replace(gains=jnp.array([1.0, -1.0]))}, "gains must hold 2 positive"),
         ({"scales": SCALES._replace(gains=jnp.ones(3))}, "gains must hold 2 positive"),
     ],

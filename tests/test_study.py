@@ -1,0 +1,105 @@
+"""The study at a small size, and (slow) its claims at full size."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from lpvid.study import MODEL_NAMES, run_study, summary
+
+# Squared norm over ‖G_anal‖∞ at the seven points, 001, table 2.
+TABLE_2 = [4.03e-3, 2.1e-3, 1.48e-3, 1.25e-3, 1.03e-3, 7.28e-4, 4.79e-4]
+THREE_POINTS = (np.pi / 4, np.pi / 2, 3 * np.pi / 4)
+
+
+@pytest.fixture(scope="module")
+def small():
+    stages = []
+    result = run_study(
+        jax.random.key(0), runs=1, theta2=THREE_POINTS, n_samples=6000, report=stages.append
+    )
+    return result, stages
+
+
+def test_the_small_study_is_whole(small):
+    result, stages = small
+    assert len(stages) == 5 and "Identifying 3 noisy records" in stages[1]
+    assert set(result.seconds) == {"simulate", "identify", "average", "restructure", "validate"}
+    assert result.records.local.lengths == result.noisy.lengths == (600, 600, 600)
+    assert set(result.sweep_outputs) == set(result.lpv) == set(MODEL_NAMES)
+    for y in result.sweep_outputs.values():
+        assert y.shape == result.records.sweep.y.shape and np.all(np.isfinite(y))
+    assert result.failed_runs == 0
+    assert [model.nx for model in result.black_boxes] == [6, 6, 6]
+
+
+def test_noise_is_30_db(small):
+    result, _ = small
+    clean = np.asarray(result.records.local.y)
+    noise = np.asarray(result.noisy.y) - clean
+    records = zip(np.split(clean, 3), np.split(noise, 3), strict=True)
+    ratios = [10 * np.log10(np.var(y, axis=0) / np.var(e, axis=0)) for y, e in records]
+    np.testing.assert_allclose(ratios, 30.0, atol=1.0)
+
+
+def test_even_the_small_study_finds_the_plant(small):
+    result, _ = small
+    # One noisy record of 0.6 s each: rougher than the full study, but no wrong minimum.
+    assert np.all(np.asarray(result.relative_cost) < 0.02)
+    assert np.all(np.asarray(result.local_bft) > 85.0)
+    for found, black_box in zip(result.restructured, result.black_boxes, strict=True):
+        assert found.hits >= 1 and found.error_norm <= found.history[0]
+        assert bool(found.model.is_stable()) and bool(black_box.is_stable())
+
+
+def test_relative_cost_is_table_2s(small):
+    result, _ = small
+    found, analytic = result.restructured[1], result.analytic[1]
+    omega = np.concatenate([[0.0], np.geomspace(0.1, 2e4, 20_000)])
+
+    def peak(system):
+        return np.linalg.svd(system.frequency_response(omega), compute_uv=False).max()
+
+    expected = peak(found.model - result.black_boxes[1]) ** 2 / peak(analytic)
+    np.testing.assert_allclose(result.relative_cost[1], expected, rtol=1e-3)
+
+
+def test_summary_is_json(small):
+    result, _ = small
+    text = json.dumps(summary(result), allow_nan=False)
+    figures = json.loads(text)
+    assert set(figures) == {
+        "theta2",
+        "bft",
+        "vaf",
+        "local_bft",
+        "local_vaf",
+        "relative_cost",
+        "fit_percent",
+        "fit_percent_by_model",
+        "hits",
+        "margin",
+        "failed_runs",
+        "seconds",
+        "seconds_by_stage",
+    }
+    assert figures["bft"]["restructured"] == np.asarray(result.sweep_bft["restructured"]).tolist()
+    assert set(figures["fit_percent"]) == {"1", "2"}
+    assert len(figures["margin"]) == 3
+
+
+def test_a_study_without_runs_is_refused():
+    with pytest.raises(ValueError, match="runs: at least one"):
+        run_study(jax.random.key(0), runs=0)
+
+
+@pytest.mark.slow
+def test_the_full_study_keeps_its_promises():
+    result = run_study(jax.random.key(0))
+    assert result.failed_runs == 0
+    restructured, analytic, balanced = (np.asarray(result.sweep_bft[n]) for n in MODEL_NAMES)
+    assert np.all(restructured >= analytic - 1.0), (restructured, analytic)
+    assert np.all(restructured > balanced), (restructured, balanced)
+    assert np.asarray(result.local_bft).min() >= 93.0
+    assert np.all(np.asarray(result.relative_cost) < TABLE_2)
