@@ -29,7 +29,7 @@ RATE_HZ = 400.0
 BAND_HZ = (2.0, 15.0)
 ESTIMATION, TEST = (1, 3, 5, 7), (2, 4, 6)
 REFERENCE_FORCE = 50.0
-# By rising frequency: the mode at 7.3 Hz, which the mount's clearance softens most.
+# Index, by rising frequency, of the mode at 7.3 Hz: the highest peak, softer at every level.
 SOFTENING = 4
 
 

@@ -6,12 +6,24 @@ from pathlib import Path
 
 
 def write_atomically(path: str | os.PathLike[str], content: bytes) -> Path:
-    """Write `content` to `path` so that a reader sees the old file or the new one, never a part.
+    """Write bytes to a file so that a reader sees the old file or the new one, never a part.
 
     The bytes go to a temporary file in the same folder, which then replaces the target; an
     interruption leaves the old file as it was. Missing folders are not made.
 
-    Returns the path written. Raises `OSError` where the folder is missing or not writable.
+    Args:
+        path: where to; a link's target is replaced, not the link.
+        content: the whole of the new file.
+
+    Returns:
+        The path given.
+
+    Raises:
+        OSError: the folder is missing or not writable.
+
+    Example:
+        >>> write_atomically("note.txt", b"hello").read_bytes()
+        b'hello'
     """
     # A link is followed: its target is replaced, not the link.
     target = Path(os.path.realpath(path))

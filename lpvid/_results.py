@@ -40,7 +40,15 @@ class Status(eqx.Enumeration):
 
 
 def is_successful(status: Status):
-    """Whether a status says success (a boolean array under `jit` and `vmap`)."""
+    """Whether a status says success (a boolean array under `jit` and `vmap`).
+
+    Args:
+        status: how a computation ended.
+
+    Example:
+        >>> bool(is_successful(Status.max_steps))
+        False
+    """
     return status == Status.successful
 
 

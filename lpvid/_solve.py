@@ -36,7 +36,7 @@ class Bounds(eqx.Module):
 
     Example:
         >>> bounds = Bounds(jnp.array([0.0]), jnp.array([jnp.inf]))
-        >>> bounds.bounded(bounds.free(jnp.array([2.0]))).item()
+        >>> round(bounds.bounded(bounds.free(jnp.array([2.0]))).item(), 12)
         2.0
     """
 
@@ -89,10 +89,10 @@ def least_squares(
     max_steps: int = 80,
     tolerance: float = 1e-8,
 ) -> Solution:
-    """Minimise ½‖residual(x)‖² by Levenberg–Marquardt from one start; never raises.
+    """Minimise half the sum of squares of a residual from one start; never raises.
 
-    The Jacobian is taken in forward mode. Use `jax.vmap` over `start` for several starts. Works
-    under `jit`; derivatives of the minimum follow from the implicit function theorem.
+    Levenberg–Marquardt, the Jacobian taken in forward mode. Use `jax.vmap` over `start` for several
+    starts. Works under `jit`; derivatives of the minimum follow from the implicit function theorem.
 
     Args:
         residual: function of the parameters, real values of any shape.
@@ -101,7 +101,7 @@ def least_squares(
         tolerance: relative and absolute, on the last step and its gain.
 
     Returns:
-        The best point seen, its cost ½‖residual‖² (infinite where it is not finite) and the
+        The best point seen, half the sum of squares there (infinite where it is not finite) and the
         status: `successful`, `max_steps` or `nonfinite`.
 
     Example:

@@ -49,7 +49,16 @@ _NONFINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
 class ModelFileError(ValueError):
-    """A file cannot be read as a model; the message names file, reason and remedy."""
+    """A file cannot be read as a model; the message names file, reason and remedy.
+
+    Example:
+        >>> from lpvid.io import ModelFileError, load
+        >>> try:
+        ...     load("missing.json")
+        ... except ModelFileError as error:
+        ...     print(error)
+        missing.json: it cannot be read (No such file or directory); check the path and its ...
+    """
 
 
 def save(path: str | os.PathLike[str], obj: Any) -> Path:
@@ -59,14 +68,24 @@ def save(path: str | os.PathLike[str], obj: Any) -> Path:
     comes back bit for bit (a NaN as a NaN). The file is replaced in one step: an interruption
     leaves the old one.
 
-    Returns the path. Raises `ValueError` for an object that cannot be saved (a
-    `FunctionStructure`, whose Python function has no place in a file; values traced by JAX) and
-    `OSError` where the folder cannot be written.
+    Args:
+        path: where to.
+        obj: what to save.
 
-    **Example**
+    Returns:
+        The path.
 
-        save("arm.json", lpv)
-        lpv = load("arm.json")
+    Raises:
+        ValueError: an object that cannot be saved (a `FunctionStructure`, whose Python function has
+            no place in a file; values traced by JAX).
+        OSError: the folder is missing or not writable.
+
+    Example:
+        >>> from lpvid.io import load, save
+        >>> from lpvid.models import StateSpace
+        >>> path = save("lag.json", StateSpace([[-1.0]], [[1.0]], [[0.1]]))
+        >>> load(path).C.item()
+        0.1
     """
     name = type(obj).__name__
     if _CLASSES.get(name) is not type(obj) and not isinstance(obj, FunctionStructure):
@@ -87,13 +106,18 @@ def save(path: str | os.PathLike[str], obj: Any) -> Path:
 def load(path: str | os.PathLike[str]) -> Any:
     """Read what `save` has written.
 
-    Raises `ModelFileError` (a `ValueError`) for a file that is missing, unreadable, truncated,
-    not lpvid's, of a newer version, of an unknown kind, or with fields that do not fit.
+    Args:
+        path: the file.
 
-    **Example**
+    Raises:
+        ModelFileError: (a `ValueError`) the file is missing, unreadable, truncated, not lpvid's, of
+            a newer version, of an unknown kind, or has fields that do not fit.
 
-        lpv = load("arm.json")
-        lpv.at(0.4)
+    Example:
+        >>> from lpvid.io import load, save
+        >>> from lpvid.models import ModalStructure
+        >>> load(save("modes.json", ModalStructure(2, 1, 1))) == ModalStructure(2, 1, 1)
+        True
     """
     document = _document(path)
     if not isinstance(document, dict) or document.get("format") != _FORMAT:
@@ -164,7 +188,11 @@ def _field_names(cls: type) -> tuple[str, ...]:
 
 
 def _encode(value: Any, where: str) -> Any:
-    """JSON for a value; `where` says in messages which attribute it is."""
+    """JSON for a value; `where` says in messages which attribute it is.
+
+    Raises:
+        ValueError: the value cannot be saved.
+    """
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):

@@ -25,16 +25,23 @@ class Report:
     The page is one file: styles and pictures are inside, there is no script and nothing is
     fetched. It reads on a phone and in the dark. All text is escaped.
 
-    **Example**
+    Attributes:
+        title: heading of the page and name of its tab.
+        parts: what the page holds so far, as HTML.
 
-        page = (
-            Report("Two-link arm")
-            .heading("Fit")
-            .paragraph("Best fit rate on validation data.")
-            .table([[1, 99.2], [2, 98.7]], ["point", "BFT (%)"])
-            .figure(lpvid.plot.bode(fit.model), "Frequency response")
-        )
-        page.write("report.html")
+    Example:
+        >>> from lpvid.models import StateSpace
+        >>> from lpvid.plot import bode
+        >>> from lpvid.report import Report
+        >>> page = (
+        ...     Report("Two-link arm")
+        ...     .heading("Fit")
+        ...     .paragraph("Best fit rate on validation data.")
+        ...     .table([[1, 99.2], [2, 98.7]], ["point", "BFT (%)"])
+        ...     .figure(bode(StateSpace([[-1.0]], [[1.0]], [[1.0]])), "Frequency response")
+        ... )
+        >>> page.write("report.html").name
+        'report.html'
     """
 
     title: str
@@ -44,7 +51,15 @@ class Report:
         return dataclasses.replace(self, parts=(*self.parts, part))
 
     def heading(self, text: str, level: int = 2) -> "Report":
-        """A heading of level 2, 3 or 4 (the title is 1)."""
+        """A heading.
+
+        Args:
+            text: what it says.
+            level: 2, 3 or 4 (the title is 1).
+
+        Raises:
+            ValueError: another level.
+        """
         if level not in (2, 3, 4):
             raise ValueError(f"level: 2, 3 or 4 is needed, got {level}.")
         return self._with(f"<h{level}>{html.escape(text)}</h{level}>")
@@ -63,7 +78,13 @@ class Report:
     ) -> "Report":
         """A table; cells are written as in `text_table`, columns of numbers to the right.
 
-        Raises `ValueError` where a row has another length than `headers`.
+        Args:
+            rows: cells, row by row.
+            headers: one for each column.
+            caption: what the table shows.
+
+        Raises:
+            ValueError: a row has another length than `headers`.
         """
         cells, numeric = _formatted(rows, headers)
         shade = [' class="number"' if is_number else "" for is_number in numeric]
@@ -85,11 +106,16 @@ class Report:
         )
 
     def figure(self, picture: Any, caption: str = "", *, alt: str | None = None) -> "Report":
-        """A picture: Matplotlib axes or figure (which is closed), or the path of a PNG file.
+        """A picture.
 
-        `alt` describes it to those who cannot see it; the caption by default.
+        Args:
+            picture: Matplotlib axes or figure (which is closed), or the path of a PNG file.
+            caption: what it shows.
+            alt: description for those who cannot see it; the caption by default.
 
-        Raises `ValueError` for a file that is no PNG, `OSError` for one that cannot be read.
+        Raises:
+            ValueError: a file that is no PNG.
+            OSError: a file that cannot be read.
         """
         if isinstance(picture, str | os.PathLike):
             content = Path(picture).read_bytes()
@@ -122,7 +148,17 @@ class Report:
         )
 
     def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write the page; an interruption leaves the old file. Returns the path."""
+        """Write the page; an interruption leaves the old file.
+
+        Args:
+            path: where to.
+
+        Returns:
+            The path.
+
+        Raises:
+            OSError: the folder is missing or not writable.
+        """
         return write_atomically(path, self.to_html().encode())
 
 
@@ -131,10 +167,14 @@ def text_table(rows: Sequence[Sequence[Any]], headers: Sequence[str]) -> str:
 
     Floats have four significant digits, `None` is a dash, truth values are yes and no.
 
-    Raises `ValueError` where a row has another length than `headers`.
+    Args:
+        rows: cells, row by row.
+        headers: one for each column.
 
-    **Example**
+    Raises:
+        ValueError: a row has another length than `headers`.
 
+    Example:
         >>> from lpvid.report import text_table
         >>> print(text_table([["arm", 99.123456], ["wafer", 87.5]], ["plant", "BFT (%)"]))
         plant  BFT (%)
@@ -159,7 +199,11 @@ def text_table(rows: Sequence[Sequence[Any]], headers: Sequence[str]) -> str:
 def _formatted(
     rows: Sequence[Sequence[Any]], headers: Sequence[str]
 ) -> tuple[list[list[str]], list[bool]]:
-    """Cells as text, and which columns hold numbers (and nothing but them and gaps)."""
+    """Cells as text, and which columns hold numbers (and nothing but them and gaps).
+
+    Raises:
+        ValueError: a row has another length than `headers`.
+    """
     plain = []
     for number, row in enumerate(rows):
         if len(row) != len(headers):

@@ -153,7 +153,7 @@ def run_study(
     lpv = {name: _interpolate(name, local[name], kappas, degree) for name in MODEL_NAMES}
     sweep = records.sweep
     outputs = {
-        name: model.simulate(u=sweep.u, kappa=sweep.kappa, dt=sweep.dt)
+        name: model.simulate(u=sweep.u, kappa=jnp.asarray(sweep.kappa), dt=sweep.dt)
         for name, model in lpv.items()
     }
     fits = {

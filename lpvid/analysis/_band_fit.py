@@ -7,7 +7,7 @@ from jaxtyping import Array, Complex, Float
 from lpvid.data import IOData
 from lpvid.models import StateSpace
 
-Band = tuple[float, float]
+Band = tuple[float | int, float | int]
 
 
 def band_lines(data: IOData, band: Band) -> Float[Array, " line"]:

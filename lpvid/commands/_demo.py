@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 
 import jax
-import matplotlib
 import numpy as np
 from tqdm import tqdm
 
@@ -30,6 +29,8 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
     folder = make_folder("--out", arguments.out)
     keep_compiled_code()
     # Pictures go to files: no window, no display needed.
+    import matplotlib
+
     matplotlib.use("Agg")
     with _Progress(_STAGES + 1) as progress:
         result = run_study(

@@ -25,7 +25,11 @@ def read_arrays(
     dt: float | None,
     resample: bool,
 ) -> IOData:
-    """One record from a file of arrays, which `load` opens."""
+    """One record from a file of arrays; the other arguments are those of `read_csv`.
+
+    Args:
+        load: opens the file: its path and content in, arrays by name out.
+    """
     path = Path(path)
     source = str(path)
     request = make_request(source, inputs, outputs, scheduling, time, dt, resample)

@@ -44,7 +44,12 @@ def make_request(
     dt: float | None,
     resample: bool,
 ) -> Request:
-    """Check the reader's arguments before any file is touched."""
+    """Check the reader's arguments before any file is touched.
+
+    Raises:
+        DataError: no column for inputs or outputs, neither or both of `time` and `dt`, a sample
+            time that is not positive and finite, or `resample` without `time`.
+    """
     request = Request(
         _names(inputs),
         _names(outputs),
@@ -82,9 +87,17 @@ def assemble(
     columns: Mapping[str, Mapping[str, np.ndarray]],
     place: Callable[[int], str],
 ) -> IOData:
-    """Records from `columns`: for each requested name, its labelled vectors `(time,)`.
+    """One record from columns of numbers, once they are known to be sound.
 
-    `place` says where row `i` is ("line 17"), for messages.
+    Args:
+        source: what the columns come from, for messages.
+        request: which columns play which part.
+        columns: for each requested name its labelled vectors (time,).
+        place: where a row is, counted from 0, such as "line 17", for messages.
+
+    Raises:
+        DataError: unequal lengths, samples that are not finite, fewer than two rows, or a time
+            column that is several, does not increase, or is not uniform and not to be resampled.
     """
     vectors = {label: v for name in request.columns for label, v in columns[name].items()}
     _check_lengths(source, vectors)

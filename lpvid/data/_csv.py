@@ -33,22 +33,29 @@ def read_csv(
     Blank lines, and lines starting with `#` or `%` above the table, are passed over, and so is an
     empty last column. The decimal sign is a point.
 
-    **Arguments:**
+    Args:
+        path: the file.
+        inputs: name of the input column, or several.
+        outputs: name of the output column, or several.
+        scheduling: name of the scheduling column, or several; none by default.
+        time: name of the time column, in seconds. It must be uniform to 1e-3 of a step; the sample
+            time is the mean step.
+        dt: sample time in seconds, instead of `time`.
+        resample: where time is not uniform, interpolate linearly to a grid at the median step.
 
-    - `inputs`, `outputs`, `scheduling`: names of the columns, one or several.
-    - `time`: name of the time column, in seconds. It must be uniform to 1e-3 of a step; the
-        sample time is the mean step. Or `dt`: the sample time in seconds.
-    - `resample`: where time is not uniform, interpolate linearly to a grid at the median step.
+    Raises:
+        DataError: (a `ValueError`) naming file, line and column: missing columns (listing those
+            there), text or nothing where a number should be, rows of unequal length, time that is
+            not uniform or does not increase, values that are not finite, empty, cut-off or missing
+            files.
 
-    **Raises:** `DataError` (a `ValueError`) naming file, line and column: missing columns (listing
-    those there), text or nothing where a number should be, rows of unequal length, time that is
-    not uniform or does not increase, values that are not finite, empty, cut-off or missing files.
-
-    !!! example
-
-        ```python
-        data = read_csv("run.csv", inputs=["u1", "u2"], outputs="y", time="t")
-        ```
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import read_csv
+        >>> rows = [[0.0, 1.0, 5.0], [0.1, 2.0, 6.0], [0.2, 3.0, 7.0]]
+        >>> np.savetxt("run.csv", rows, delimiter=",", header="t,u,y", comments="")
+        >>> read_csv("run.csv", inputs="u", outputs="y", time="t")
+        IOData(3 samples, 1 input (u), 1 output (y), dt=0.1 s)
     """
     path = Path(path)
     source = str(path)
@@ -96,7 +103,11 @@ class _Table:
             raise DataError(f"{source} is empty below its header, line {first + 1}.")
 
     def check_column(self, name: str) -> None:
-        """Raise unless there is exactly one column `name`."""
+        """Find out whether there is exactly one column `name`.
+
+        Raises:
+            DataError: there is none, or there are several.
+        """
         if name not in self.header:
             raise missing_column(self.source, name, self.header)
         if self.header.count(name) > 1:
@@ -130,7 +141,11 @@ class _Table:
         return values if values.shape[1] == len(self.header) else None
 
     def slow_values(self, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-        """The named columns, cell by cell; finds the cell that is wrong."""
+        """The named columns, cell by cell; finds the cell that is wrong.
+
+        Raises:
+            DataError: a row of another length, or a cell that is no number.
+        """
         wanted = {name: self.header.index(name) for name in names}
         columns: dict[str, list[float]] = {name: [] for name in names}
         last = max(number for number, line in enumerate(self.lines) if line.strip())

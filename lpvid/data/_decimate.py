@@ -25,17 +25,31 @@ _REACH = 26
 
 
 class Decimate(AbstractStep):
-    """Keep every `factor`-th sample of `u`, `y` and `kappa`, in each record, after a zero-phase
-    low-pass that leaves 80 dB below what would alias.
+    """Keep every `factor`-th sample of inputs, outputs and scheduling, after a low-pass filter.
 
-    The filter is a symmetric FIR filter (Kaiser window; pass band to 0.8, stop band from 1.0 of the
-    new Nyquist frequency; ripple 1e-4), run over each record extended by point reflection at its
-    ends: constants and straight lines pass unchanged. The first sample of a record stays its
-    first. Inputs and outputs are filtered alike; an input that was held between samples is not held
-    any more, so identify at a rate well above the dynamics. Not differentiable.
+    The filter has no phase and leaves 80 dB below what would alias. It is a symmetric FIR filter
+    (Kaiser window; pass band to 0.8, stop band from 1.0 of the new Nyquist frequency; ripple 1e-4),
+    run over each record extended by point reflection at its ends: constants and straight lines pass
+    unchanged. The first sample of a record stays its first. Inputs and outputs are filtered alike;
+    an input that was held between samples is not held any more, so identify at a rate well above
+    the dynamics. Not differentiable.
 
-    **Raises:** `ValueError` for a factor below 1, a record not longer than 27 samples after
-    decimation, and tracers.
+    Attributes:
+        factor: one sample in so many is kept.
+
+    Raises:
+        ValueError: a factor below 1; when applied, a record not longer than 27 samples after
+            decimation, and tracers.
+
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import Decimate, IOData, preprocess
+        >>> ramp = np.arange(200.0)
+        >>> slow, undo = preprocess(IOData(u=ramp, y=ramp, dt=0.01), Decimate(4))
+        >>> slow
+        IOData(50 samples, 1 input (u1), 1 output (y1), dt=0.04 s)
+        >>> undo(slow).n_samples
+        200
     """
 
     factor: int = eqx.field(static=True)
@@ -45,7 +59,11 @@ class Decimate(AbstractStep):
             raise ValueError(f"Decimate: factor is {self.factor}: give an integer of 1 or more.")
 
     def apply(self, data: IOData) -> tuple[IOData, "DecimateReversal"]:
-        """Data at the lower rate, and what is lost by interpolating back."""
+        """Data at the lower rate, and what is lost by interpolating back.
+
+        Raises:
+            ValueError: a record too short for the filter, or tracers.
+        """
         shortest = min(data.lengths)
         if shortest <= (_REACH + 1) * self.factor:
             raise ValueError(
@@ -73,7 +91,17 @@ class Decimate(AbstractStep):
 
 
 class DecimateReversal(AbstractReversal):
-    """Original minus interpolated signals, and the original rate."""
+    """Original minus interpolated signals, and the original rate.
+
+    Attributes:
+        step: the step that is undone.
+        u_removed: what the inputs lost.
+        y_removed: what the outputs lost.
+        kappa_removed: what the scheduling lost.
+        factor: one sample in so many was kept.
+        dt: original sample time in seconds.
+        lengths: original lengths of the records.
+    """
 
     step: AbstractStep
     u_removed: Float[Array, "time nu"]

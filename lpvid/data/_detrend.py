@@ -9,10 +9,23 @@ from lpvid.data._preprocess import AbstractReversal, AbstractStep, check_output,
 
 
 class Detrend(AbstractStep):
-    """Take the mean (`order=0`) or the least-squares line (`order=1`) out of each channel of `u`
-    and `y`, in each record on its own. `kappa` keeps its values. Differentiable.
+    """Take the mean or the straight line of each channel out of inputs and outputs.
 
-    **Raises:** `ValueError` for another order.
+    Each record has its own trend, estimated by least squares. The scheduling keeps its values.
+    Differentiable.
+
+    Attributes:
+        order: 0 for the mean, 1 for a straight line.
+
+    Raises:
+        ValueError: another order.
+
+    Example:
+        >>> from lpvid.data import Detrend, IOData, preprocess
+        >>> data = IOData(u=[1.0, 3.0], y=[5.0, 9.0], dt=0.1)
+        >>> moving, undo = preprocess(data, Detrend())
+        >>> moving.y[:, 0].tolist(), undo(moving).y[:, 0].tolist()
+        ([-2.0, 2.0], [5.0, 9.0])
     """
 
     order: int = eqx.field(static=True, default=0)
@@ -33,7 +46,14 @@ class Detrend(AbstractStep):
 
 
 class DetrendReversal(AbstractReversal):
-    """The trends that were taken out, sample by sample."""
+    """The trends that were taken out, sample by sample.
+
+    Attributes:
+        step: the step that is undone.
+        u_trend: trends of the inputs.
+        y_trend: trends of the outputs.
+        lengths: lengths of the records they were taken out of.
+    """
 
     step: AbstractStep
     u_trend: Float[Array, "time nu"]

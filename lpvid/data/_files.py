@@ -6,7 +6,11 @@ from lpvid.data._errors import DataError
 
 
 def file_bytes(path: Path) -> bytes:
-    """The file's content, not empty."""
+    """The file's content, not empty.
+
+    Raises:
+        DataError: the file is missing, a folder, unreadable or empty.
+    """
     if not path.exists():
         raise DataError(f"{path}: no such file; check the path and the working folder.")
     if path.is_dir():

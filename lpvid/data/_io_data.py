@@ -25,38 +25,54 @@ from lpvid.data._signals import (
 
 
 class IOData(eqx.Module):
-    r"""Records of a system: inputs `u`, outputs `y`, scheduling `kappa`, sample time `dt`.
+    """Records of a system: inputs `u`, outputs `y`, scheduling `kappa`, sample time `dt`.
 
     Immutable, and a pytree: `u`, `y` and `kappa` are leaves, all else is static, so it passes
     through `jax.jit`, `jax.vmap` and `jax.grad`. Several records are stored one after the other in
     time; `lengths` says where one ends, and `records` takes them apart.
 
-    **Arguments:**
+    Args:
+        u: inputs. One record is (time,) or (time, channel); records of equal length are
+            (record, time, channel); records of any lengths are a list or tuple of arrays.
+        y: outputs, as many records and samples as `u`.
+        dt: sample time in seconds, positive.
+        kappa: scheduling κ, or `None`. One record: a scalar or (nk,) (constant, broadcast over
+            time), (time,) or (time, nk); a one-dimensional kappa as long as the record is a time
+            series. Several records: a scalar for all, or one such entry for each along the first
+            axis.
+        names: mapping from "u", "y", "kappa" to a string, or to one string for each channel; u1,
+            y1, kappa1, ... by default.
+        units: mapping like `names`; empty strings by default.
 
-    - `u`, `y`: `(time,)` or `(time, channel)` for one record; `(record, time, channel)` for
-        records of equal length; a list or tuple of arrays, one for each record, of any lengths.
-    - `dt`: sample time in seconds, positive.
-    - `kappa`: scheduling $\kappa$, or `None`. One record: a scalar or `(nk,)` (constant, broadcast
-        over time), `(time,)` or `(time, nk)`; a one-dimensional kappa as long as the record is a
-        time series. Several records: a scalar for all, or one such entry a record along the first
-        axis.
-    - `names`, `units`: mapping from `"u"`, `"y"`, `"kappa"` to a string or one string a channel.
-        Names default to `u1`, `y1`, `kappa1`; units to empty strings.
+    Attributes:
+        u: inputs of all records, (time, nu).
+        y: outputs of all records, (time, ny).
+        kappa: scheduling of all records, (time, nk), or `None`.
+        dt: sample time in seconds.
+        lengths: samples in each record.
+        input_names: one for each input.
+        output_names: one for each output.
+        scheduling_names: one for each scheduling variable.
+        input_units: one for each input.
+        output_units: one for each output.
+        scheduling_units: one for each scheduling variable.
 
-    **Raises:** `ValueError`, naming the argument, for shapes that are ambiguous (more channels than
-    samples: nothing is transposed by guess), unequal lengths, `dt <= 0`, records of fewer than two
-    samples, samples that are not finite (not checked for tracers), and labels that do not fit.
+    Raises:
+        ValueError: naming the argument: shapes that are ambiguous (more channels than samples:
+            nothing is transposed by guess), unequal lengths, a sample time that is not positive,
+            records of fewer than two samples, samples that are not finite (not checked for
+            tracers), labels that do not fit.
 
-    !!! example
-
-        ```python
-        import jax.numpy as jnp
-        from lpvid.data import IOData
-
-        t = 0.01 * jnp.arange(200)
-        data = IOData(u=jnp.sin(t), y=jnp.cos(t), dt=0.01, kappa=0.3, names={"u": "torque"})
-        train, test = data.split(0.5)
-        ```
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData
+        >>> t = 0.01 * np.arange(200)
+        >>> data = IOData(u=np.sin(t), y=np.cos(t), dt=0.01, kappa=0.3, names={"u": "torque"})
+        >>> data
+        IOData(200 samples, 1 input (torque), 1 output (y1), kappa 1, dt=0.01 s)
+        >>> train, test = data.split(0.25)
+        >>> train.n_samples, test.n_samples
+        (50, 150)
     """
 
     u: Float[Array, "time nu"]
@@ -132,7 +148,7 @@ class IOData(eqx.Module):
 
     @property
     def time(self) -> Float[Array, " time"]:
-        """Seconds since the start of the record each sample belongs to, `(time,)`."""
+        """Seconds since the start of the record each sample belongs to, (time,)."""
         return jnp.asarray(np.concatenate([self.dt * np.arange(n) for n in self.lengths]))
 
     @property
@@ -146,10 +162,11 @@ class IOData(eqx.Module):
 
     @property
     def operating_point(self) -> Float[Array, " nk"]:
-        """The constant scheduling `(nk,)` of a single record.
+        """The constant scheduling (nk,) of a single record.
 
-        **Raises:** `ValueError` without `kappa`, for several records, and where `kappa` varies by
-        more than rounding (1e-9 of its magnitude; not checked for tracers).
+        Raises:
+            ValueError: there is no `kappa`, there are several records, or `kappa` varies by more
+                than rounding (1e-9 of its magnitude; not checked for tracers).
         """
         kappa = self.kappa
         if kappa is None:
@@ -170,7 +187,11 @@ class IOData(eqx.Module):
         return point
 
     def __getitem__(self, index: Any) -> "IOData":
-        """Samples `data[a:b]` of a single record; no steps (`Decimate` filters first)."""
+        """Samples `data[a:b]` of a single record; no steps (`Decimate` filters first).
+
+        Raises:
+            ValueError: anything but a slice, a step, several records, or fewer than two samples.
+        """
         if not isinstance(index, slice):
             raise ValueError(
                 f"data[{index!r}]: index time by a slice such as data[100:200]; take records from "
@@ -190,11 +211,18 @@ class IOData(eqx.Module):
         return self._cut([(start, stop)])
 
     def split(self, at: float | int) -> tuple["IOData", "IOData"]:
-        """First part and rest of every record, cut at a fraction (float) or sample index (int).
+        """First part and rest of every record.
 
-        A fraction is rounded to whole samples in each record; a negative index counts from the end.
+        Args:
+            at: where to cut: a fraction (float), rounded to whole samples in each record, or a
+                sample index (int), from the end where it is negative.
 
-        **Raises:** `ValueError` where a part would have fewer than two samples.
+        Returns:
+            The data before the cut, and from the cut on.
+
+        Raises:
+            ValueError: the fraction does not lie between 0 and 1, or a part would have fewer than
+                two samples.
         """
         if isinstance(at, float) and not 0 < at < 1:
             raise ValueError(f"split: the fraction {at} must lie between 0 and 1.")
@@ -219,9 +247,16 @@ class IOData(eqx.Module):
         outputs: str | Sequence[str] | None = None,
         scheduling: str | Sequence[str] | None = None,
     ) -> "IOData":
-        """Channels by name, in the order given; `None` keeps all, `scheduling=()` drops kappa.
+        """Channels by name, in the order given.
 
-        **Raises:** `ValueError` for a name that is not there, listing those that are.
+        Args:
+            inputs: names of the inputs to keep; `None` keeps all.
+            outputs: names of the outputs to keep; `None` keeps all.
+            scheduling: names of the scheduling variables to keep; `None` keeps all, `()` drops
+                kappa.
+
+        Raises:
+            ValueError: a name that is not there; those that are get listed.
         """
         chosen = {
             "u": _chosen(inputs, self.input_names, "inputs"),
@@ -255,9 +290,20 @@ class IOData(eqx.Module):
     ) -> "IOData":
         """A copy with some parts replaced; `None` keeps a part.
 
-        A signal of several records may be stacked as stored, `(time, channel)`, or given as the
+        A signal of several records may be stacked as stored, (time, channel), or given as the
         constructor takes it. Labels are kept for channels whose number does not change, and may
         be given in part: `names={"u": "torque"}`.
+
+        Args:
+            u: inputs.
+            y: outputs.
+            kappa: scheduling.
+            dt: sample time in seconds.
+            names: channel names.
+            units: channel units.
+
+        Raises:
+            ValueError: as the constructor does.
         """
         inputs = split_records(self.u, self.lengths) if u is None else self._as_records(u, "u")
         outputs = split_records(self.y, self.lengths) if y is None else self._as_records(y, "y")

@@ -10,14 +10,19 @@ from lpvid.data._signals import split_records
 def join(parts: Sequence[IOData]) -> IOData:
     """Several `IOData` as one, all their records in the order given.
 
-    **Raises:** `ValueError` unless all have the same sample time (to 1e-6 of it: measured time
-    stamps are not better), channel names and units, and all or none have `kappa`.
+    Args:
+        parts: one or more of them.
 
-    !!! example
+    Raises:
+        ValueError: nothing is given; sample times (to 1e-6 of them: measured time stamps are not
+            better), channel names or units differ; only some have `kappa`.
 
-        ```python
-        both = join([low_amplitude, high_amplitude])
-        ```
+    Example:
+        >>> from lpvid.data import IOData, join
+        >>> low = IOData(u=[0.0, 1.0], y=[0.0, 2.0], dt=0.1)
+        >>> high = IOData(u=[0.0, 3.0, 4.0], y=[0.0, 6.0, 8.0], dt=0.1)
+        >>> join([low, high]).lengths
+        (2, 3)
     """
     parts = list(parts)
     if not parts:

@@ -11,7 +11,17 @@ _KEYS = ("u", "y", "kappa")
 def channel_labels(
     given: Labels | None, argument: str, counts: Mapping[str, int]
 ) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Labels of u, y and kappa, checked against the channel `counts`."""
+    """Labels of inputs, outputs and scheduling, in this order.
+
+    Args:
+        given: what the user gave.
+        argument: its name, "names" or "units", for messages.
+        counts: number of channels under "u", "y" and "kappa".
+
+    Raises:
+        ValueError: an unknown key, a number of labels that does not fit, a label that is no string,
+            or a name twice.
+    """
     given = {} if given is None else given
     unknown = sorted(set(given) - set(_KEYS))
     if unknown:
@@ -21,7 +31,11 @@ def channel_labels(
 
 
 def positions(wanted: str | Sequence[str], names: tuple[str, ...], argument: str) -> list[int]:
-    """Index of each wanted channel in `names`."""
+    """Index of each wanted channel in `names`.
+
+    Raises:
+        ValueError: one is not there.
+    """
     wanted = (wanted,) if isinstance(wanted, str) else tuple(wanted)
     missing = [name for name in wanted if name not in names]
     if missing:

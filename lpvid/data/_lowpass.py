@@ -20,13 +20,27 @@ from lpvid.data._signals import split_records
 
 
 class Lowpass(AbstractStep):
-    """Butterworth low-pass of `u` and `y` alike, so that a linear plant stays what it was.
+    """Butterworth low-pass of inputs and outputs alike, so that a linear plant stays what it was.
 
     Run forwards and backwards over each record (`scipy.signal.sosfiltfilt`): no delay, and twice
-    the attenuation, -6 dB at `cutoff_hz`. `kappa` keeps its values. Not differentiable.
+    the attenuation, -6 dB at `cutoff_hz`. The scheduling keeps its values. Not differentiable.
 
-    **Raises:** `ValueError` for a cutoff that is not between 0 and the Nyquist frequency, an order
-    below 1, a record too short for the filter, and tracers.
+    Attributes:
+        cutoff_hz: cutoff frequency in Hz.
+        order: order of the filter that is run twice.
+
+    Raises:
+        ValueError: a cutoff that is not positive, an order below 1; when applied, a cutoff not
+            below the Nyquist frequency, a record too short for the filter, and tracers.
+
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData, Lowpass, preprocess
+        >>> t = 0.01 * np.arange(400)
+        >>> slow, fast = np.sin(2 * np.pi * t), np.sin(2 * np.pi * 40 * t)
+        >>> clean, undo = preprocess(IOData(u=slow, y=slow + fast, dt=0.01), Lowpass(10.0))
+        >>> bool(np.abs(clean.y - clean.u)[50:-50].max() < 1e-3)
+        True
     """
 
     cutoff_hz: float = eqx.field(static=True)
@@ -39,7 +53,12 @@ class Lowpass(AbstractStep):
             raise ValueError(f"Lowpass: order is {self.order}: give 1 or more.")
 
     def apply(self, data: IOData) -> tuple[IOData, "LowpassReversal"]:
-        """Filtered data, and what the filter took out."""
+        """Filtered data, and what the filter took out.
+
+        Raises:
+            ValueError: a cutoff not below the Nyquist frequency, a record too short for the filter,
+                or tracers.
+        """
         nyquist = 0.5 / data.dt
         if self.cutoff_hz >= nyquist:
             raise ValueError(
@@ -73,7 +92,14 @@ class Lowpass(AbstractStep):
 
 
 class LowpassReversal(AbstractReversal):
-    """What the filter took out, sample by sample."""
+    """What the filter took out, sample by sample.
+
+    Attributes:
+        step: the step that is undone.
+        u_removed: what the inputs lost.
+        y_removed: what the outputs lost.
+        lengths: lengths of the records.
+    """
 
     step: AbstractStep
     u_removed: Float[Array, "time nu"]

@@ -28,19 +28,32 @@ def read_mat(
 ) -> IOData:
     """Read one record from a MATLAB `.mat` file, version 4 to 7.3.
 
-    Arrays are `(time, channel)` or vectors, rows or columns. The name of an array of several
+    Arrays are (time, channel) or vectors, rows or columns. The name of an array of several
     columns stands for all of them, called `acc[0]`, `acc[1]`, ... (from 0); `"acc[0]"` picks one.
     A structure's fields are called `run.u`. Scalars are no columns: pass the sample time by value.
-    Version 7.3 needs the optional package h5py. Arguments are those of `read_csv`.
+    Version 7.3 needs the optional package h5py.
 
-    **Raises:** `DataError` (a `ValueError`) naming file, array and sample, as `read_csv`; and for
-    damaged files and arrays of unequal length. `ImportError` for version 7.3 without h5py.
+    Args:
+        path: the file.
+        inputs: as for `read_csv`.
+        outputs: as for `read_csv`.
+        scheduling: as for `read_csv`.
+        time: as for `read_csv`.
+        dt: as for `read_csv`.
+        resample: as for `read_csv`.
 
-    !!! example
+    Raises:
+        DataError: (a `ValueError`) naming file, array and sample, as `read_csv`; and for damaged
+            files and arrays of unequal length.
+        ImportError: a file of version 7.3, and h5py is not installed.
 
-        ```python
-        data = read_mat("DATA_EMPS.mat", inputs="vir", outputs="qm", time="t")
-        ```
+    Example:
+        >>> import numpy as np
+        >>> import scipy.io
+        >>> from lpvid.data import read_mat
+        >>> scipy.io.savemat("run.mat", {"force": np.ones(50), "acc": np.ones((50, 2))})
+        >>> read_mat("run.mat", inputs="force", outputs="acc", dt=1e-3)
+        IOData(50 samples, 1 input (force), 2 outputs (acc[0], acc[1]), dt=0.001 s)
     """
     return read_arrays(path, _load, inputs, outputs, scheduling, time, dt, resample)
 

@@ -24,18 +24,29 @@ def read_npz(
 ) -> IOData:
     """Read one record from an `.npz` archive.
 
-    Arrays are `(time,)` or `(time, channel)`. The name of an array of several columns stands for
+    Arrays are (time,) or (time, channel). The name of an array of several columns stands for
     all of them, called `acc[0]`, `acc[1]`, ...; `"acc[0]"` picks one. Scalars are no columns: pass
-    the sample time by value. Arguments are those of `read_csv`.
+    the sample time by value.
 
-    **Raises:** `DataError` (a `ValueError`) naming file, array and sample, as `read_csv`; and for
-    damaged archives and arrays of unequal length.
+    Args:
+        path: the file.
+        inputs: as for `read_csv`.
+        outputs: as for `read_csv`.
+        scheduling: as for `read_csv`.
+        time: as for `read_csv`.
+        dt: as for `read_csv`.
+        resample: as for `read_csv`.
 
-    !!! example
+    Raises:
+        DataError: (a `ValueError`) naming file, array and sample, as `read_csv`; and for damaged
+            archives and arrays of unequal length.
 
-        ```python
-        data = read_npz("level1.npz", inputs="force", outputs="acc", dt=1 / 400)
-        ```
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import read_npz
+        >>> np.savez("level1.npz", force=np.ones(50), acc=np.ones((50, 2)))
+        >>> read_npz("level1.npz", inputs="force", outputs="acc[1]", dt=1 / 400)
+        IOData(50 samples, 1 input (force), 1 output (acc[1]), dt=0.0025 s)
     """
     return read_arrays(path, _load, inputs, outputs, scheduling, time, dt, resample)
 

@@ -10,7 +10,7 @@ from lpvid.data._preprocess import AbstractReversal, AbstractStep, check_output,
 
 
 class Offset(AbstractStep):
-    """Take given constants out of each channel of `u` and `y`, record by record.
+    """Take given constants out of each channel of inputs and outputs, record by record.
 
     `Detrend` estimates its means on whatever it is applied to; this step keeps those it was made
     with, so that what is learned on training data alone is taken out of test data too.
@@ -20,9 +20,13 @@ class Offset(AbstractStep):
         y: one value for each record and output.
 
     Example:
-        >>> train, test = data.split(0.5)  # doctest: +SKIP
-        >>> clean, undo = preprocess(train, Offset.mean_of(train))  # doctest: +SKIP
-        >>> clean_test, _ = preprocess(test, *undo.steps)  # doctest: +SKIP
+        >>> from lpvid.data import IOData, Offset, preprocess
+        >>> data = IOData(u=[1.0, 3.0, 4.0, 4.0], y=[5.0, 9.0, 8.0, 8.0], dt=0.1)
+        >>> train, test = data.split(0.5)
+        >>> clean, undo = preprocess(train, Offset.mean_of(train))
+        >>> clean_test, _ = preprocess(test, *undo.steps)
+        >>> clean_test.y[:, 0].tolist()
+        [1.0, 1.0]
     """
 
     u: Float[Array, "record nu"]
@@ -58,7 +62,12 @@ class Offset(AbstractStep):
 
 
 class OffsetReversal(AbstractReversal):
-    """The offsets, and the lengths of the records they were taken out of."""
+    """The offsets, and the lengths of the records they were taken out of.
+
+    Attributes:
+        step: the step that is undone, which holds the offsets.
+        lengths: lengths of the records.
+    """
 
     # The offsets themselves are the step's.
     step: AbstractStep

@@ -21,16 +21,26 @@ def from_pandas(
 ) -> IOData:
     """One record from the columns of a pandas `DataFrame`.
 
-    `time` names a column or the index, in seconds or of a date-time or time-delta type. Other
-    arguments are those of `read_csv`. pandas itself is not needed by this library.
+    pandas itself is not needed by this library.
 
-    **Raises:** `DataError` (a `ValueError`) naming column and row (counted from 0), as `read_csv`.
+    Args:
+        frame: the data frame.
+        inputs: as for `read_csv`.
+        outputs: as for `read_csv`.
+        scheduling: as for `read_csv`.
+        time: a column or the index, in seconds or of a date-time or time-delta type.
+        dt: as for `read_csv`.
+        resample: as for `read_csv`.
 
-    !!! example
+    Raises:
+        DataError: (a `ValueError`) naming column and row (counted from 0), as `read_csv`.
 
-        ```python
-        data = from_pandas(frame, inputs="u", outputs=["y1", "y2"], dt=0.01)
-        ```
+    Example:
+        >>> import pandas as pd
+        >>> from lpvid.data import from_pandas
+        >>> frame = pd.DataFrame({"u": [1.0, 2.0, 3.0], "y": [5.0, 6.0, 7.0]})
+        >>> from_pandas(frame, inputs="u", outputs="y", dt=0.01)
+        IOData(3 samples, 1 input (u), 1 output (y), dt=0.01 s)
     """
     source = "data frame"
     if not hasattr(frame, "columns") or not hasattr(frame, "index"):

@@ -1,6 +1,7 @@
 """Periodic records: one band of excited lines, at a lower rate, without leakage or filters."""
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from lpvid.data._preprocess import (
     check_output,
     check_restorable,
 )
-from lpvid.data._signals import split_records
+from lpvid.data._signals import Samples, split_records
 
 # Share of the input's power that may differ from period to period; more than noise ever does.
 _UNREPEATED = 0.1
@@ -55,8 +56,8 @@ class PeriodicBand(AbstractStep):
         IOData(40 samples, 1 input (u1), 1 output (y1), dt=0.2 s)
     """
 
-    low_hz: float = eqx.field(static=True)
-    high_hz: float = eqx.field(static=True)
+    low_hz: float | int = eqx.field(static=True)
+    high_hz: float | int = eqx.field(static=True)
     samples_per_period: int | None = eqx.field(static=True, default=None)
     periods: int = eqx.field(static=True, default=2)
     recorded_periods: int = eqx.field(static=True, default=1)
@@ -90,12 +91,11 @@ class PeriodicBand(AbstractStep):
             kept[key] = [
                 _repeated(resampled(period, samples, wanted), self.periods) for period in periods
             ]
-            removed[key] = jnp.concatenate(
-                [
-                    piece - _repeated(resampled(period, recorded, wanted), self.recorded_periods)
-                    for piece, period in zip(pieces, periods, strict=True)
-                ]
-            )
+            left = [
+                piece - _repeated(resampled(period, recorded, wanted), self.recorded_periods)
+                for piece, period in zip(pieces, periods, strict=True)
+            ]
+            removed[key] = jnp.asarray(_numpy_of(left[0]).concatenate(left))
         dt = data.dt * recorded / samples
         processed = IOData(**kept, dt=dt, names=data.names, units=data.units)
         reversal = PeriodicBandReversal(
@@ -105,7 +105,9 @@ class PeriodicBand(AbstractStep):
             removed["kappa"],
             data.dt,
             data.lengths,
+            self.recorded_periods,
             processed.lengths,
+            self.periods,
         )
         return processed, reversal
 
@@ -149,8 +151,8 @@ class PeriodicBand(AbstractStep):
             )
         return slice(first, last + 1)
 
-    def _averaged(self, piece: Float[Array, "_ channel"], recorded: int):
-        return jnp.mean(jnp.reshape(piece, (self.recorded_periods, recorded, -1)), axis=0)
+    def _averaged(self, piece: Samples, recorded: int) -> Samples:
+        return piece.reshape(self.recorded_periods, recorded, -1).mean(axis=0)
 
     def _check_input(self, data: IOData, pieces, periods, lines: slice) -> None:
         if isinstance(data.u, Tracer):
@@ -186,7 +188,9 @@ class PeriodicBandReversal(AbstractReversal):
     kappa_removed: Float[Array, "time nk"] | None
     dt: float = eqx.field(static=True)
     lengths: tuple[int, ...] = eqx.field(static=True)
+    recorded_periods: int = eqx.field(static=True)
     processed: tuple[int, ...] = eqx.field(static=True)
+    processed_periods: int = eqx.field(static=True)
 
     def restore(self, data: IOData) -> IOData:
         """Data at the recorded rate, from the mean of its periods, with what lay outside."""
@@ -213,29 +217,30 @@ class PeriodicBandReversal(AbstractReversal):
 
     def _back(self, signal: Float[Array, "_ channel"], which: int | None):
         """Periods of every record (their mean, or one of them) at the recorded rate."""
-        step = self.step
-        assert isinstance(step, PeriodicBand)
-        recorded = self.lengths[0] // step.recorded_periods
-        samples = self.processed[0] // step.periods
+        recorded = self.lengths[0] // self.recorded_periods
+        samples = self.processed[0] // self.processed_periods
         lines = slice(0, (min(recorded, samples) + 1) // 2)
         back = []
         for piece in split_records(signal, self.processed):
-            periods = jnp.reshape(piece, (step.periods, samples, -1))
-            period = jnp.mean(periods, axis=0) if which is None else periods[which]
-            back.append(_repeated(resampled(period, recorded, lines), step.recorded_periods))
-        return jnp.concatenate(back)
+            periods = piece.reshape(self.processed_periods, samples, -1)
+            period = periods.mean(axis=0) if which is None else periods[which]
+            back.append(_repeated(resampled(period, recorded, lines), self.recorded_periods))
+        return jnp.asarray(_numpy_of(back[0]).concatenate(back))
 
 
-def resampled(
-    period: Float[Array, "_ channel"], samples: int, lines: slice
-) -> Float[Array, "_ channel"]:
+def resampled(period: Samples, samples: int, lines: slice) -> Samples:
     """One period on another number of samples, of the given lines alone (below both Nyquists)."""
-    recorded = period.shape[0]
-    spectrum = jnp.fft.rfft(period, axis=0)[lines]
+    xp, recorded = _numpy_of(period), period.shape[0]
+    spectrum = xp.fft.rfft(period, axis=0)[lines]
     padding = (lines.start, samples // 2 + 1 - lines.stop)
-    spectrum = jnp.pad(spectrum, (padding, (0, 0))) * (samples / recorded)
-    return jnp.fft.irfft(spectrum, samples, axis=0)
+    spectrum = xp.pad(spectrum, (padding, (0, 0))) * (samples / recorded)
+    return xp.fft.irfft(spectrum, samples, axis=0)
 
 
-def _repeated(period: Float[Array, "_ channel"], times: int) -> Float[Array, "_ channel"]:
-    return jnp.tile(period, (times, 1))
+def _repeated(period: Samples, times: int) -> Samples:
+    return _numpy_of(period).tile(period, (times, 1))
+
+
+def _numpy_of(signal: Samples) -> Any:
+    """NumPy for samples, which compiles nothing for each new length; JAX for tracers."""
+    return jnp if isinstance(signal, Tracer) else np

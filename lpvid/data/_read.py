@@ -36,16 +36,28 @@ def read(
     """Read records from one file, or one record from each of several.
 
     The suffix says how: `.csv`, `.txt`, `.dat` and `.tsv` by `read_csv`, `.mat` by `read_mat`,
-    `.npz` by `read_npz`; their arguments are the same.
+    `.npz` by `read_npz`.
 
-    **Raises:** `DataError` (a `ValueError`) for another suffix, no file at all, files whose sample
-    times or channels differ, and whatever the reader raises.
+    Args:
+        path: the file, or several.
+        inputs: as for `read_csv`.
+        outputs: as for `read_csv`.
+        scheduling: as for `read_csv`.
+        time: as for `read_csv`.
+        dt: as for `read_csv`.
+        resample: as for `read_csv`.
 
-    !!! example
+    Raises:
+        DataError: (a `ValueError`) for another suffix, no file at all, files whose sample times or
+            channels differ, and whatever the reader raises.
 
-        ```python
-        data = read(["low.csv", "high.csv"], inputs="u", outputs="y", time="t")
-        ```
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import read
+        >>> for name in ("low.npz", "high.npz"):
+        ...     np.savez(name, u=np.ones(50), y=np.ones(50))
+        >>> read(["low.npz", "high.npz"], inputs="u", outputs="y", dt=0.1)
+        IOData(50 samples x 2 records, 1 input (u), 1 output (y), dt=0.1 s)
     """
     paths = [path] if isinstance(path, str | os.PathLike) else list(path)
     if not paths:

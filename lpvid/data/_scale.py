@@ -11,15 +11,27 @@ _KINDS = ("std", "range", "peak")
 
 
 class Scale(AbstractStep):
-    """Divide each channel of `u` and `y` by one factor, the same in all records.
+    """Divide each channel of inputs and outputs by one factor, the same in all records.
 
-    `kind` says which: `"std"` the standard deviation, `"range"` largest minus smallest value,
-    `"peak"` the largest magnitude, over all records together. A channel for which that is zero is
-    left as it is. `u` and `y` give factors `(nu,)`, `(ny,)` or a scalar instead. No offset is
-    taken out (`Detrend` does that), and `kappa` keeps its values: it is an operating point. The
-    scaled channels have no unit. Differentiable.
+    A channel for which the factor would be zero is left as it is. No offset is taken out (`Detrend`
+    does that), and the scheduling keeps its values: it is an operating point. The scaled channels
+    have no unit. Differentiable.
 
-    **Raises:** `ValueError` for another kind, and factors that do not fit the channels.
+    Args:
+        kind: how the factors are found, over all records together: "std" is the standard deviation,
+            "range" largest minus smallest value, "peak" the largest magnitude.
+        u: factors (nu,) of the inputs, or a scalar, to be used instead.
+        y: factors (ny,) of the outputs, or a scalar, to be used instead.
+
+    Raises:
+        ValueError: another kind; when applied, factors that do not fit the channels.
+
+    Example:
+        >>> from lpvid.data import IOData, Scale, preprocess
+        >>> data = IOData(u=[1.0, -2.0], y=[4.0, -8.0], dt=0.1)
+        >>> scaled, undo = preprocess(data, Scale("peak"))
+        >>> scaled.y[:, 0].tolist()
+        [0.5, -1.0]
     """
 
     kind: str = eqx.field(static=True)
@@ -36,7 +48,11 @@ class Scale(AbstractStep):
         self.y = None if y is None else jnp.atleast_1d(jnp.asarray(y, float))
 
     def apply(self, data: IOData) -> tuple[IOData, "ScaleReversal"]:
-        """Scaled data, and the factors."""
+        """Scaled data, and the factors.
+
+        Raises:
+            ValueError: the factors given do not fit the channels.
+        """
         u = _factors(data.u, self.kind) if self.u is None else _given(self.u, data.nu, "u")
         y = _factors(data.y, self.kind) if self.y is None else _given(self.y, data.ny, "y")
         scaled = data.replace(
@@ -49,7 +65,15 @@ class Scale(AbstractStep):
 
 
 class ScaleReversal(AbstractReversal):
-    """The factors the channels were divided by."""
+    """The factors the channels were divided by.
+
+    Attributes:
+        step: the step that is undone, with these factors.
+        u: factors of the inputs.
+        y: factors of the outputs.
+        input_units: units before.
+        output_units: units before.
+    """
 
     step: AbstractStep
     u: Float[Array, " nu"]

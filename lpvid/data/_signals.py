@@ -22,7 +22,15 @@ _LONGEST_OPERATING_POINT = 16
 
 
 def as_records(signal: Signals, argument: str) -> list[Samples]:
-    """Split a public argument into records `(time, channel)`; raise on ambiguous shapes."""
+    """Split a public argument into records (time, channel).
+
+    Args:
+        signal: what the user gave.
+        argument: its name, for messages.
+
+    Raises:
+        ValueError: an ambiguous shape, or values that are not real numbers.
+    """
     if isinstance(signal, list | tuple):
         if len(signal) == 0:
             raise ValueError(f"{argument} is empty: give one array, or one array for each record.")
@@ -48,7 +56,11 @@ def as_records(signal: Signals, argument: str) -> list[Samples]:
 
 
 def as_scheduling(kappa: Signals, lengths: tuple[int, ...]) -> list[Samples]:
-    """Scheduling records `(time, nk)` of the given lengths; constants are broadcast over time."""
+    """Scheduling records (time, nk) of the given lengths; constants are broadcast over time.
+
+    Raises:
+        ValueError: another number of records or samples.
+    """
     several = len(lengths) > 1
     if isinstance(kappa, list | tuple) and any(np.ndim(entry) > 0 for entry in kappa):
         entries = list(kappa)
@@ -77,7 +89,11 @@ def check_finite(
     names: tuple[str, ...],
     lengths: tuple[int, ...],
 ) -> None:
-    """Raise on the first non-finite sample; tracers have no values yet and pass."""
+    """Find out whether all samples are finite; tracers have no values yet and pass.
+
+    Raises:
+        ValueError: naming the channel, record and sample that is not.
+    """
     if isinstance(signal, Tracer):
         return
     finite = np.isfinite(signal)
@@ -101,7 +117,11 @@ def split_records(signal: Any, lengths: tuple[int, ...]) -> list[Any]:
 
 
 def stack_records(records: list[Samples], argument: str) -> Samples:
-    """Records one after the other, `(time, channel)`; they must have the same channels."""
+    """Records one after the other, (time, channel).
+
+    Raises:
+        ValueError: their channels differ in number.
+    """
     for number, record in enumerate(records):
         if record.shape[1] != records[0].shape[1]:
             raise ValueError(
@@ -115,7 +135,11 @@ def stack_records(records: list[Samples], argument: str) -> Samples:
 
 
 def common_lengths(inputs: list[Samples], outputs: list[Samples]) -> tuple[int, ...]:
-    """Length of each record, equal for inputs and outputs."""
+    """Length of each record, equal for inputs and outputs.
+
+    Raises:
+        ValueError: numbers of records or samples differ.
+    """
     if len(inputs) != len(outputs):
         raise ValueError(
             f"y has {len(outputs)} record(s) but u has {len(inputs)}: give both for every record."
@@ -131,7 +155,11 @@ def common_lengths(inputs: list[Samples], outputs: list[Samples]) -> tuple[int, 
 
 
 def sample_time(dt: Any) -> float:
-    """The sample time as a Python float, positive."""
+    """The sample time as a Python float, positive.
+
+    Raises:
+        ValueError: it is not positive and finite, or a tracer.
+    """
     if isinstance(dt, Tracer):
         raise ValueError("dt is traced: it is static; pass a Python float from outside jit.")
     dt = float(dt)

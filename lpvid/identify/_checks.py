@@ -13,8 +13,9 @@ _LARGEST_DEFAULT = 15
 def resolve_block_rows(method: AbstractSubspaceMethod, data: IOData) -> int:
     """Block rows to use: the method's, or a default that the records can carry.
 
-    **Raises:** `ValueError` for too few samples, naming how many are needed, and for an order that
-    the block rows cannot carry.
+    Raises:
+        ValueError: too few samples, naming how many are needed; an order that the block rows cannot
+            carry.
     """
     nu, ny, lengths = data.nu, data.ny, data.lengths
     order = method.order
@@ -61,7 +62,11 @@ def _require_samples(block_rows: int, nu: int, ny: int, lengths: tuple[int, ...]
 
 
 def check_varying(data: IOData) -> None:
-    """Raise for a channel that never moves."""
+    """Look for a channel that never moves.
+
+    Raises:
+        ValueError: naming the first one found.
+    """
     for values, names, kind in (
         (data.u, data.input_names, "Input"),
         (data.y, data.output_names, "Output"),

@@ -22,12 +22,13 @@ _GRAM_FLOOR = 1e-13
 
 
 class DataFactor(eqx.Module):
-    r"""Blocks of the lower-triangular L in $[U_f; Z; Y_f] = L Q$, Z the instruments.
+    """Blocks of the lower-triangular L in $[U_f; Z; Y_f] = L Q$, Z the instruments.
 
-    With `s` block rows, `nu` inputs, `ny` outputs and `nz` instruments (the past inputs, and the
-    past outputs where the method wants them). Channels are scaled to unit RMS.
+    The instruments are the past inputs, and the past outputs where the method wants them. Channels
+    are scaled to unit RMS.
 
     Attributes:
+        inputs: $L_{11}$.
         instruments_inputs: $L_{21}$.
         instruments: $L_{22}$.
         outputs_inputs: $L_{31}$.
@@ -58,7 +59,10 @@ class Conditioning(eqx.Module):
 
 
 def hankel_rows(block_rows: int, nu: int, ny: int, past_outputs: bool) -> np.ndarray:
-    """Delay and channel of every row of [Uf; Up; (Yp); Yf], `(row, 2)`."""
+    """Delay and channel of every row of the data matrix, integers (row, 2).
+
+    From the top: future inputs, past inputs, past outputs where they are asked for, future outputs.
+    """
     past, future = range(block_rows), range(block_rows, 2 * block_rows)
     inputs, outputs = range(nu), range(nu, nu + ny)
     parts = [(future, inputs), (past, inputs)]
@@ -77,7 +81,20 @@ def data_factor(
     past_outputs: bool,
     route: Route,
 ) -> tuple[DataFactor, Conditioning]:
-    """Factor the block-Hankel data of `w = [u y]`, its channels divided by `scale`."""
+    """Factor the block-Hankel matrix of inputs and outputs.
+
+    Args:
+        w: inputs, then outputs, records one after the other, (time, channel).
+        scale: what each channel is divided by.
+        lengths: samples in each record.
+        block_rows: rows of past and of future.
+        nu: how many of the channels are inputs.
+        past_outputs: whether past outputs are among the instruments.
+        route: "gram" for the Cholesky factor of the Gram matrix, "qr" for reflections.
+
+    Returns:
+        The factor's blocks, and what the factorisation says of the data.
+    """
     ny = w.shape[1] - nu
     rows = hankel_rows(block_rows, nu, ny, past_outputs)
     weight = 1.0 / scale[rows[:, 1]]

@@ -15,7 +15,7 @@ _EDGES_AT_ONCE = 16
 def lagged_products(
     w: Float[Array, "time channel"], n_lags: int
 ) -> Float[Array, "lag channel channel"]:
-    r"""Sums $R_\tau = \sum_t w_t w_{t+\tau}^\top$ for $\tau = 0 \dots$ `n_lags` − 1.
+    r"""Sums $R_\tau = \sum_t w_t w_{t+\tau}^\top$ for all lags $\tau$ below `n_lags`.
 
     Samples beyond the end count as zero. The signal is cut into short blocks, and the products of a
     block with itself and its successors are one matrix product over all blocks, the sums along
@@ -52,19 +52,18 @@ def hankel_gram(
 ) -> Float[Array, "row row"]:
     r"""Gram matrix $\sum_r H_r H_r^\top$ of the block-Hankel matrices of several records.
 
-    Column t of $H$ stacks the samples $w_t, w_{t+1}, \dots$; `rows` `(row, 2)` says which delay and
-    channel each row takes, so past and future, inputs and outputs come out in any order.
+    Column t of $H$ stacks the samples $w_t, w_{t+1}, \dots$; `rows` says which delay and channel
+    each row takes, so past and future, inputs and outputs come out in any order.
 
     Displacement structure: block (i, j) follows from its upper-left neighbour by a rank-one update
     and downdate, $G_{i+1,j+1} = G_{ij} + w_{i+M} w_{j+M}^\top - w_i w_j^\top$ with M columns.
     Summed along the diagonals that is $G = T - P P^\top$: T block Toeplitz in the lagged products,
     P the samples at the records' two ends. $O(N s c^2 + s^3 c^2)$ operations, memory $O(s^2 c^2)$.
 
-    **Arguments:**
-
-    - `w`: records one after the other, `(time, channel)`.
-    - `lengths`: samples in each record, each at least the number of delays.
-    - `rows`: delays and channels, integers `(row, 2)`.
+    Args:
+        w: records one after the other, (time, channel).
+        lengths: samples in each record, each at least the number of delays.
+        rows: delays and channels, integers (row, 2).
     """
     channels = w.shape[1]
     delay, channel = rows[:, 0], rows[:, 1]
@@ -116,11 +115,15 @@ def _take(values: Array, flat: np.ndarray) -> Array:
 def hankel_factor(
     w: Float[Array, "time channel"], lengths: tuple[int, ...], rows: np.ndarray
 ) -> Float[Array, "row row"]:
-    """Lower factor L of the block-Hankel data, H = L Q, by Householder reflections.
+    """Lower triangular factor of the block-Hankel matrix, by Householder reflections.
 
-    Four times the digits' worth of the Gram matrix at ten times its cost: the fallback where the
-    Gram matrix is ill-conditioned. The Hankel matrix is formed a chunk of columns at a time.
-    `rows` and `lengths` as in `hankel_gram`.
+    Twice the digits of the Gram matrix at ten times its cost: the fallback where the Gram matrix is
+    ill-conditioned. The Hankel matrix is formed a chunk of columns at a time.
+
+    Args:
+        w: as for `hankel_gram`.
+        lengths: as for `hankel_gram`.
+        rows: as for `hankel_gram`.
     """
     n_rows = rows.shape[0]
     n_lags = int(rows[:, 0].max()) + 1

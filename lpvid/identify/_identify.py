@@ -41,8 +41,8 @@ class Fit(eqx.Module):
 
     Attributes:
         model: the discrete-time model, its `dt` that of the data.
-        x0: initial state of every record, `(record, nx)`.
-        singular_values: of the projected data, largest first, `(block_rows ny,)`, for channels of
+        x0: initial state of every record, (record, nx).
+        singular_values: of the projected data, largest first, (block_rows ny,), for channels of
             unit RMS and independent of the number of samples.
         order: number of states.
         status: how it ended.
@@ -50,8 +50,18 @@ class Fit(eqx.Module):
             stabilisation, `excitation_rank` (full is 2 block_rows nu), `smallest_pivot` (share of a
             data row, in squares, that the others do not explain: the reciprocal condition),
             `reflections` (whether the Gram matrix gave way to Householder reflections),
-            `residual_std` of each output's simulation error, `(ny,)`, `window` (samples after which
+            `residual_std` of each output's simulation error, (ny,), `window` (samples after which
             the state was freed anew because the model is unstable; 0: never).
+
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData
+        >>> from lpvid.identify import PastOutputMOESP, identify
+        >>> u = np.random.default_rng(0).standard_normal(500)
+        >>> y = np.convolve(u, 0.8 ** np.arange(50))[:500]
+        >>> fit = identify(IOData(u=u, y=y, dt=0.1), PastOutputMOESP(order=1, block_rows=5))
+        >>> fit.order, fit.x0.shape, round(fit.stats["spectral_radius"].item(), 3)
+        (1, (1, 1), 0.8)
     """
 
     model: StateSpace
@@ -81,30 +91,30 @@ def identify(
     eigenvalue decomposition and hold while the singular values are distinct; with `stabilise` they
     do not exist where an eigenvalue is moved.
 
-    **Arguments:**
+    Args:
+        data: one or several records.
+        method: `PastOutputMOESP()` by default; `PastInputMOESP(...)`.
+        throw: raise where the data cannot give a model. `False` returns it with its status.
 
-    - `data`: one or several records.
-    - `method`: `PastOutputMOESP()` by default; `PastInputMOESP(...)`.
-    - `throw`: raise where the data cannot give a model. `False` returns it with its status.
+    Returns:
+        The model, with the initial states of the records and what was learned about the data.
 
-    **Raises:** `ValueError`, naming channel and remedy, for too few samples, constant channels,
-    inputs that excite too little, an order that the block rows cannot carry. **Warns** for an order
-    above the rank of the data and for an unstable model.
+    Raises:
+        ValueError: naming channel and remedy: too few samples, constant channels, inputs that
+            excite too little, an order that the block rows cannot carry.
 
-    !!! example
+    Warns:
+        UserWarning: the order is above the rank of the data, or the model is unstable.
 
-        ```python
-        import jax
-        import jax.numpy as jnp
-        import lpvid
-        from lpvid.data import IOData
-        from lpvid.identify import PastOutputMOESP, identify
-
-        u = jax.random.normal(jax.random.key(0), (500, 1))
-        y = jnp.convolve(u[:, 0], 0.8 ** jnp.arange(50.0))[:500]
-        fit = identify(IOData(u=u, y=y, dt=0.1), PastOutputMOESP(order=1, block_rows=5))
-        fit.model.A  # 0.8
-        ```
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData
+        >>> from lpvid.identify import PastOutputMOESP, identify
+        >>> u = np.random.default_rng(0).standard_normal(500)
+        >>> y = np.convolve(u, 0.8 ** np.arange(50))[:500]
+        >>> fit = identify(IOData(u=u, y=y, dt=0.1), PastOutputMOESP(order=1, block_rows=5))
+        >>> round(fit.model.A.item(), 3)
+        0.8
     """
     method = PastOutputMOESP() if method is None else method
     if not isinstance(method, AbstractSubspaceMethod):

@@ -41,15 +41,26 @@ def estimate_initial_state(
     least-norm solution where the model is not observable. Memory beside the data is independent of
     the record's length. Composes with `jit`, `vmap` and `grad`.
 
-    **Arguments:**
+    Args:
+        model: discrete-time, with the data's sample time; or an LPV model, for data with `kappa`.
+        data: one or several records.
 
-    - `model`: discrete-time, with the data's sample time; or an LPV model, for data with `kappa`.
-    - `data`: one or several records.
+    Returns:
+        One state for each record, (record, nx).
 
-    **Returns:** `(record, nx)`.
+    Raises:
+        ValueError: sample times or channel counts differ, or an LPV model meets data without
+            scheduling.
 
-    **Raises:** `ValueError` where sample times or channel counts differ, and where an LPV model
-    meets data without scheduling.
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData
+        >>> from lpvid.identify import estimate_initial_state
+        >>> from lpvid.models import StateSpace
+        >>> data = IOData(u=np.zeros(4), y=[3.0, 1.5, 0.75, 0.375], dt=0.1)
+        >>> model = StateSpace([[0.5]], [[1.0]], [[1.0]], dt=0.1)
+        >>> round(estimate_initial_state(model, data).item(), 6)
+        3.0
     """
     if isinstance(model, LPVStateSpace):
         return jnp.stack([_lpv_start(model, record) for record in data.records])
@@ -62,21 +73,30 @@ def estimate_initial_state(
 
 
 def simulation_fit(model: StateSpace | LPVStateSpace, data: IOData) -> Float[Array, " ny"]:
-    r"""Best fit (BFT) of each output, in percent, with every record's initial state estimated.
+    """Best fit (BFT) of each output, with every record's initial state estimated.
 
-    $100 \max(1 - \|y - \hat y\| / \|y - \bar y\|, 0)$ over all records together, the mean taken in
-    each. This is how a model is scored on records it has not seen: simulated, not predicted one
-    step ahead, and not blamed for a state that nobody measured.
+    100 max(1 - |y - ŷ| / |y - mean y|, 0) over all records together, the mean taken in each. This
+    is how a model is scored on records it has not seen: simulated, not predicted one step ahead,
+    and not blamed for a state that nobody measured.
 
-    Arguments and errors as for `estimate_initial_state`.
+    Args:
+        model: as for `estimate_initial_state`.
+        data: as for `estimate_initial_state`.
 
-    !!! example
+    Returns:
+        Percentages (ny,).
 
-        ```python
-        train, test = data.split(0.5)
-        fit = identify(train, PastOutputMOESP(order=6))
-        simulation_fit(fit.model, test)
-        ```
+    Raises:
+        ValueError: as `estimate_initial_state` does.
+
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData
+        >>> from lpvid.identify import simulation_fit
+        >>> from lpvid.models import StateSpace
+        >>> data = IOData(u=np.zeros(4), y=[3.0, 1.5, 0.75, 0.375], dt=0.1)
+        >>> simulation_fit(StateSpace([[0.5]], [[1.0]], [[1.0]], dt=0.1), data).round(3).tolist()
+        [100.0]
     """
     starts = estimate_initial_state(model, data)
     missed = jnp.zeros(data.ny)

@@ -11,7 +11,14 @@ from lpvid.identify._simulation_error import NormalEquations
 
 
 class LinearFit(eqx.Module):
-    """B, D, x0 of every record, and the residual's sum of squares for each output."""
+    """What is linear in the simulation error once A and C are known.
+
+    Attributes:
+        B: input matrix.
+        D: feedthrough.
+        x0: initial state of every record.
+        residual: sum of squares of each output's simulation error.
+    """
 
     B: Float[Array, "nx nu"]
     D: Float[Array, "ny nu"]
@@ -20,7 +27,13 @@ class LinearFit(eqx.Module):
 
 
 def solve(equations: NormalEquations, *, nx: int, feedthrough: bool) -> LinearFit:
-    """Least squares for B and D, one x0 for each record."""
+    """Least squares for B and D, one x0 for each record.
+
+    Args:
+        equations: normal equations of every record.
+        nx: number of states.
+        feedthrough: whether D is estimated; zero otherwise.
+    """
     records, ny, entries = equations.right.shape
     nu = entries // (nx + 1) - 1
     place = jnp.asarray(placement(nx, nu, ny, feedthrough))

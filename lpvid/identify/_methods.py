@@ -14,6 +14,31 @@ class AbstractSubspaceMethod(eqx.Module):
 
     The engine factors the data, asks the method for the matrix whose range is that of the
     observability matrix, and does the rest: order, A and C, stabilisation, B, D and x0.
+
+    Attributes:
+        order: number of states, or "auto".
+        block_rows: rows of past and of future, or `None` for a default.
+        feedthrough: whether D is estimated.
+        stabilise: `False`, or the radius that eigenvalues of A are moved onto.
+        past_outputs: whether past outputs are among the instruments.
+
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData
+        >>> from lpvid.identify import AbstractSubspaceMethod, identify
+        >>> class InstrumentalVariables(AbstractSubspaceMethod):
+        ...     order: int = 1
+        ...     block_rows: int = 5
+        ...     feedthrough: bool = True
+        ...     stabilise: bool = False
+        ...     past_outputs = True
+        ...     def project(self, factor):
+        ...         return factor.outputs_instruments @ factor.instruments.T, None
+        >>> u = np.random.default_rng(0).standard_normal(500)
+        >>> y = np.convolve(u, 0.8 ** np.arange(50))[:500]
+        >>> fit = identify(IOData(u=u, y=y, dt=0.1), InstrumentalVariables())
+        >>> round(fit.model.A.item(), 3)
+        0.8
     """
 
     order: eqx.AbstractVar[int | Literal["auto"]]
@@ -30,12 +55,14 @@ class AbstractSubspaceMethod(eqx.Module):
     ]:
         """Matrix whose dominant left range is looked for, and the weight to undo.
 
-        The second value is the W with W O the range of the first, or `None` for the identity.
+        Returns:
+            The matrix, and the W by which the observability matrix is multiplied in its range, or
+            `None` for the identity.
         """
 
 
 class PastOutputMOESP(AbstractSubspaceMethod):
-    r"""PO-MOESP: past inputs and past outputs as instruments. The choice for measured data.
+    """PO-MOESP: past inputs and past outputs as instruments. The choice for measured data.
 
     With $[U_f; U_p; Y_p; Y_f] = L Q$ the range of the observability matrix is that of
     $L_{32}$, the future outputs freed of the future inputs and correlated with the past
@@ -43,22 +70,26 @@ class PastOutputMOESP(AbstractSubspaceMethod):
     innovations form from input-output data", Automatica 30). Consistent for output noise that is
     coloured by the system or independent of the past.
 
-    **Arguments:**
+    Args:
+        order: number of states, or "auto" for the largest gap between the singular values.
+        block_rows: s, the rows of past and of future; `None` for twice the order and at least 10,
+            or 15 with `order="auto"`. Long horizons separate slow modes.
+        feedthrough: whether D is estimated; `False` keeps it zero.
+        stabilise: `False`, or a radius: eigenvalues of A outside it are moved onto it, and B, D
+            and x0 are then estimated for the moved A.
 
-    - `order`: number of states, or `"auto"` for the largest gap between the singular values.
-    - `block_rows`: s, the rows of past and of future; `None` for twice the order and at least 10,
-        or 15 with `order="auto"`. Long horizons separate slow modes.
-    - `feedthrough`: whether D is estimated; `False` keeps it zero.
-    - `stabilise`: `False`, or a radius: eigenvalues of A outside it are moved onto it, and B, D
-        and x0 are then estimated for the moved A.
+    Raises:
+        ValueError: a setting out of its range.
 
-    !!! example
-
-        ```python
-        from lpvid.identify import PastOutputMOESP, identify
-
-        fit = identify(data, PastOutputMOESP(order=6, block_rows=20))
-        ```
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData
+        >>> from lpvid.identify import PastOutputMOESP, identify
+        >>> u = np.random.default_rng(0).standard_normal(500)
+        >>> y = np.convolve(u, 0.8 ** np.arange(50))[:500]
+        >>> method = PastOutputMOESP(order="auto", block_rows=5, feedthrough=True)
+        >>> identify(IOData(u=u, y=y, dt=0.1), method).order
+        1
     """
 
     order: int | Literal["auto"] = eqx.field(static=True)
@@ -85,14 +116,33 @@ class PastOutputMOESP(AbstractSubspaceMethod):
 
 
 class PastInputMOESP(AbstractSubspaceMethod):
-    r"""PI-MOESP: past inputs alone as instruments.
+    """PI-MOESP: past inputs alone as instruments.
 
     With $[U_f; U_p; Y_f] = L Q$ the range is that of $L_{32}$ (Verhaegen 1993, "Subspace model
     identification, part 3", Int. J. Control 58). Consistent for any output noise that is
     independent of the input, but with more variance than `PastOutputMOESP`: on short or lightly
     damped records it may come out unstable.
 
-    Arguments as for `PastOutputMOESP`.
+    Args:
+        order: number of states, or "auto" for the largest gap between the singular values.
+        block_rows: s, the rows of past and of future; `None` for twice the order and at least 10,
+            or 15 with `order="auto"`. Long horizons separate slow modes.
+        feedthrough: whether D is estimated; `False` keeps it zero.
+        stabilise: `False`, or a radius: eigenvalues of A outside it are moved onto it, and B, D
+            and x0 are then estimated for the moved A.
+
+    Raises:
+        ValueError: a setting out of its range.
+
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData
+        >>> from lpvid.identify import PastInputMOESP, identify
+        >>> u = np.random.default_rng(0).standard_normal(500)
+        >>> y = np.convolve(u, 0.8 ** np.arange(50))[:500]
+        >>> fit = identify(IOData(u=u, y=y, dt=0.1), PastInputMOESP(order=1, block_rows=5))
+        >>> round(fit.model.A.item(), 2)
+        0.8
     """
 
     order: int | Literal["auto"] = eqx.field(static=True)

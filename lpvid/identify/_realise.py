@@ -10,8 +10,10 @@ def left_range(
 ) -> tuple[Float[Array, "row row"], Float[Array, " row"]]:
     """Left singular vectors and singular values, largest first.
 
-    `squared=True` takes them from the eigenvectors of M Mᵀ, which is faster and loses nothing where
-    M already comes from a Gram matrix.
+    Args:
+        matrix: whose range is looked for.
+        squared: take them from the eigenvectors of the matrix times its transpose, which is faster
+            and loses nothing where the matrix already comes from a Gram matrix.
     """
     if squared:
         values, vectors = jnp.linalg.eigh(matrix @ matrix.T, symmetrize_input=False)

@@ -25,12 +25,12 @@ class NormalEquations(eqx.Module):
     """Normal equations for each output k, in the entries (channel, coefficient).
 
     Channels are the inputs, then x0. Coefficients are the nx entries of a column of B (or of x0),
-    then D_kj (nothing for x0).
+    then the entry of D (nothing for x0).
 
     Attributes:
-        matrix: `(ny, (nu+1) (nx+1), (nu+1) (nx+1))`.
-        right: `(ny, (nu+1) (nx+1))`.
-        power: sum of squares of the outputs, `(ny,)`.
+        matrix: (ny, entry, entry) with (nu + 1) (nx + 1) entries; records in front.
+        right: (ny, entry).
+        power: sum of squares of the outputs, (ny,).
     """
 
     matrix: Float[Array, "*record ny entry entry"]

@@ -193,7 +193,8 @@ class FunctionStructure(AbstractStructure):
 
     def matrices(self, parameters: Parameters) -> StateSpace:
         """The model that `function` returns."""
-        return StateSpace(*self.function(parameters))
+        A, B, C, *direct = self.function(parameters)
+        return StateSpace(A, B, C, direct[0] if direct else None)
 
     def bounds(self) -> tuple[Parameters, Parameters]:
         """The bounds given."""

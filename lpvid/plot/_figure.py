@@ -69,7 +69,19 @@ def grid_of_axes(
     sharex: bool | str = False,
     height_ratios: Sequence[float] | None = None,
 ) -> np.ndarray:
-    """`rows` × `columns` axes: those given if they are as many, else of a new figure."""
+    """Axes in rows and columns: those given if they are as many, else of a new figure.
+
+    Args:
+        rows: how many rows.
+        columns: how many columns.
+        axes: those given, or `None`.
+        size: width and height of a new figure in inches.
+        sharex: whether panels of a new figure share their horizontal axes.
+        height_ratios: heights of the rows of a new figure, relative to one another.
+
+    Raises:
+        ValueError: another number of axes is given.
+    """
     if axes is None:
         import matplotlib.pyplot as plt
 
@@ -121,7 +133,17 @@ def with_unit(name: str, unit: str) -> str:
 def labelled(
     items: Any, labels: Sequence[str] | str | None, argument: str, noun: str
 ) -> dict[str, Any]:
-    """One item, a sequence or a mapping as label → item."""
+    """One item, a sequence or a mapping as a mapping from label to item.
+
+    Args:
+        items: what the user gave.
+        labels: one for each item of a sequence; none for a mapping, which has its own.
+        argument: what the items are called, for messages.
+        noun: default label, numbered where there are several items.
+
+    Raises:
+        ValueError: no items, labels that do not fit, or a label twice.
+    """
     if isinstance(items, Mapping):
         if labels is not None:
             raise ValueError(f"labels: {argument} has its own; give one of the two.")
@@ -149,7 +171,11 @@ def model_of(item: Any) -> Any:
 
 
 def channel_names(names: Sequence[str] | None, count: int, prefix: str, argument: str) -> list[str]:
-    """Names given, or y1, y2, …"""
+    """Names given, or the prefix with a number: y1, y2, ...
+
+    Raises:
+        ValueError: another number of names than channels.
+    """
     if names is None:
         return [f"{prefix}{i + 1}" for i in range(count)]
     if len(names) != count:
@@ -168,7 +194,11 @@ def dashes(index: int) -> Any:
 
 
 def figure_of(axes: Any) -> Figure:
-    """The figure that axes (or an array of them, or the figure itself) belong to."""
+    """The figure that axes (or an array of them, or the figure itself) belong to.
+
+    Raises:
+        ValueError: something else is given.
+    """
     if hasattr(axes, "savefig"):
         return axes
     first = np.atleast_1d(np.asarray(axes, dtype=object)).ravel()
@@ -181,7 +211,23 @@ def figure_of(axes: Any) -> Figure:
 
 
 def png_bytes(axes: Any, *, dpi: float = 150.0, close: bool = True, form: str = "png") -> bytes:
-    """The figure of `axes` as the content of an image file; the figure is closed after."""
+    """The figure of some axes as the content of an image file.
+
+    Args:
+        axes: axes, an array of them or the figure.
+        dpi: dots per inch.
+        close: close the figure afterwards.
+        form: format of the image, as Matplotlib calls it.
+
+    Raises:
+        ValueError: no axes are given, or Matplotlib cannot write the form.
+
+    Example:
+        >>> from lpvid.models import StateSpace
+        >>> from lpvid.plot import bode, png_bytes
+        >>> png_bytes(bode(StateSpace([[-1.0]], [[1.0]], [[1.0]])))[1:4]
+        b'PNG'
+    """
     figure = figure_of(axes)
     buffer = io.BytesIO()
     figure.savefig(buffer, format=form, dpi=dpi, facecolor="white")
@@ -193,17 +239,25 @@ def png_bytes(axes: Any, *, dpi: float = 150.0, close: bool = True, form: str = 
 
 
 def save_figure(axes: Any, path: str | os.PathLike[str], *, dpi: float = 150.0) -> Path:
-    """Write the figure of `axes` to a file and close it; an interruption leaves the old file.
+    """Write the figure of some axes to a file and close it; an interruption leaves the old file.
 
-    `axes` may be axes, an array of them or the figure; the suffix of `path` gives the form (PNG
-    where there is none). Returns the path.
+    Args:
+        axes: axes, an array of them or the figure.
+        path: where to; the suffix gives the form (PNG where there is none).
+        dpi: dots per inch.
 
-    Raises `ValueError` for a form that Matplotlib cannot write, `OSError` where the folder cannot
-    be written.
+    Returns:
+        The path.
 
-    **Example**
+    Raises:
+        ValueError: no axes are given, or Matplotlib cannot write the form.
+        OSError: the folder is missing or not writable.
 
-        save_figure(bode(fit.model), "bode.png")
+    Example:
+        >>> from lpvid.models import StateSpace
+        >>> from lpvid.plot import bode, save_figure
+        >>> save_figure(bode(StateSpace([[-1.0]], [[1.0]], [[1.0]])), "bode.png").name
+        'bode.png'
     """
     form = Path(path).suffix.lstrip(".").lower() or "png"
     supported = figure_of(axes).canvas.get_supported_filetypes()

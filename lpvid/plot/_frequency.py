@@ -34,23 +34,31 @@ def bode(
 ) -> np.ndarray:
     """Magnitude of every entry of the transfer matrix: outputs down, inputs across.
 
-    **Arguments**
+    Args:
+        systems: a `StateSpace`, a result that holds one, or several in a sequence or a mapping from
+            label to system. A batch of models is drawn in one colour.
+        omega: frequencies in rad/s; by default a decade around the poles. A discrete-time model is
+            drawn up to its Nyquist frequency.
+        labels: one for each system of a sequence.
+        phase: add a row with the phase, unwrapped, in degrees, below each output.
+        decibels: magnitude in dB, or on a logarithmic axis.
+        input_names: one for each input; u1, u2, ... by default.
+        output_names: one for each output; y1, y2, ... by default.
+        axes: where to draw, as many as returned; new ones by default.
 
-    - `systems`: a `StateSpace`, a result that holds one, or several in a sequence or a mapping
-      label → system. A batch of models is drawn in one colour.
-    - `omega`: frequencies in rad/s; by default a decade around the poles. A discrete-time model
-      is drawn up to its Nyquist frequency.
-    - `labels`: one for each system of a sequence.
-    - `phase`: add a row with the phase, unwrapped, in degrees, below each output.
-    - `decibels`: magnitude in dB, or on a logarithmic axis.
+    Returns:
+        The axes, shape (ny, nu), or (2 ny, nu) with phase.
 
-    Returns the axes, shape (ny, nu), or (2 ny, nu) with phase.
+    Raises:
+        ValueError: systems with different numbers of inputs or outputs, names or axes that do not
+            fit, or no frequency below the Nyquist frequency.
 
-    Raises `ValueError` for systems with different numbers of inputs or outputs.
-
-    **Example**
-
-        bode([fit.model, truth], labels=["identified", "truth"])
+    Example:
+        >>> from lpvid.models import StateSpace
+        >>> from lpvid.plot import bode
+        >>> lag = StateSpace([[-1.0]], [[1.0]], [[1.0]])
+        >>> bode([lag, lag.discretise(0.1)], labels=["continuous", "sampled"], phase=True).shape
+        (2, 1)
     """
     models = state_spaces(systems, labels)
     ny, nu = _common_size(models)
@@ -107,11 +115,22 @@ def singular_values(
 ) -> Axes:
     """Singular values of the transfer matrix over frequency; the peak of the largest is H∞.
 
-    The arguments are those of `bode`. Systems may have different numbers of inputs and outputs.
+    Args:
+        systems: as for `bode`, but with any numbers of inputs and outputs.
+        omega: as for `bode`.
+        labels: as for `bode`.
+        decibels: as for `bode`.
+        axes: where to draw; new ones by default.
 
-    **Example**
+    Raises:
+        ValueError: no frequency lies below the Nyquist frequency.
 
-        singular_values({"error": best.model - fit_continuous})
+    Example:
+        >>> from lpvid.models import StateSpace
+        >>> from lpvid.plot import singular_values
+        >>> fast, slow = (StateSpace([[-p]], [[p]], [[1.0]]) for p in (2.0, 1.0))
+        >>> singular_values({"error": fast - slow}).get_xlabel()
+        'frequency (Hz)'
     """
     models = state_spaces(systems, labels)
     responses = _responses(models, omega)

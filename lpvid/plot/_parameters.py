@@ -25,25 +25,39 @@ def parameters(
     name: str | None = None,
     axes: Any = None,
 ) -> np.ndarray:
-    """Every parameter of an LPV model over κ, in small multiples.
+    """Every parameter of an LPV model over the scheduling, in small multiples.
 
-    **Arguments**
+    Args:
+        lpv: the model, drawn as a line.
+        kappas: where the local models are, (n_points,) or (n_points, n_scheduling).
+        parameters: those of the local models, drawn as dots, (n_points, n_parameters), or the
+            results of `restructure`.
+        reference: drawn dashed: a function from the scheduling to the parameters, or values at
+            `kappas`.
+        names: of all parameters; those of the structure by default.
+        which: indices of the parameters to draw; all by default.
+        along: with several scheduling variables, the one that is drawn.
+        at: the point that holds the others' values; the middle by default. Local models elsewhere
+            are drawn hollow.
+        name: of the scheduling variable, "κ" by default.
+        axes: where to draw, one for each parameter drawn; new ones by default.
 
-    - `kappas`, `parameters`: local models, drawn as dots: where they are, shape (n_points,) or
-      (n_points, n_scheduling), and their parameters, shape (n_points, n_parameters), or the
-      results of `restructure`.
-    - `reference`: drawn dashed: a function κ → ϑ, or values at `kappas`.
-    - `names`: of all parameters; those of the structure by default.
-    - `which`: indices of the parameters to draw; all by default.
-    - `along`, `at`: with several scheduling variables, the one that is drawn and the point that
-      holds the others' values (the middle by default). Local models elsewhere are drawn hollow.
-    - `name`: of the scheduling variable, "κ" by default.
+    Returns:
+        The axes, one for each parameter drawn.
 
-    Returns the axes, one for each parameter drawn.
+    Raises:
+        ValueError: names, points, parameters or reference of shapes that do not fit.
 
-    **Example**
-
-        parameters(lpv, kappas, local, reference=exact_parameters)
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from lpvid.models import FreeStructure, LPVStateSpace, polynomial_basis
+        >>> from lpvid.plot import parameters
+        >>> structure = FreeStructure(n_states=1, n_inputs=1, n_outputs=1, feedthrough=False)
+        >>> coefficients = jnp.array([[-3.0, 1.0, 1.0], [1.0, 0.0, 0.0]])
+        >>> basis, low, high = polynomial_basis([0.0, 2.0], 1), jnp.zeros(1), jnp.full(1, 2.0)
+        >>> lpv = LPVStateSpace(structure, basis, coefficients, low, high)
+        >>> parameters(lpv, [0.0, 2.0], [[-4.0, 1.0, 1.0], [-2.0, 1.0, 1.0]]).shape
+        (3,)
     """
     count = lpv.structure.n_parameters
     names = list(lpv.structure.parameter_names if names is None else names)
@@ -76,6 +90,7 @@ def parameters(
         if local is not None and points is not None:
             _draw_local(panel, points, local[:, index], middle, along, high - low)
         panel.set_title(names[index], loc="left")
+        _widen(panel)
     label = name or ("κ" if lpv.n_scheduling == 1 else f"κ{along + 1}")
     columns = _columns(len(chosen))
     for panel in panels[-columns:]:
@@ -87,6 +102,14 @@ def parameters(
             handles, texts, loc="outside upper right", ncols=len(handles), frameon=False
         )
     return panels
+
+
+def _widen(panel) -> None:
+    """Show at least a tenth of the parameter's size: a scatter of half a per cent is no trend."""
+    low, high = panel.get_ylim()
+    least = 0.1 * max(abs(low), abs(high))
+    if high - low < least:
+        panel.set_ylim((low + high - least) / 2, (low + high + least) / 2)
 
 
 def _draw_local(panel, points, values, middle, along, width) -> None:

@@ -37,13 +37,19 @@ def poles(
     natural frequency in Hz, with lines of equal damping ratio and the unstable half shaded.
     Discrete time: the z-plane with the unit circle.
 
-    `systems` and `labels` are those of `bode`; the poles of a batch of models make a cloud.
+    Args:
+        systems: as for `bode`; the poles of a batch of models make a cloud.
+        labels: as for `bode`.
+        axes: where to draw; new ones by default.
 
-    Raises `ValueError` for continuous- and discrete-time models together.
+    Raises:
+        ValueError: continuous- and discrete-time models together.
 
-    **Example**
-
-        poles({"identified": fit.model, "truth": truth})
+    Example:
+        >>> from lpvid.models import StateSpace
+        >>> from lpvid.plot import poles
+        >>> poles(StateSpace([[-1.0]], [[1.0]], [[1.0]])).get_xlabel()
+        'real part / 2π (Hz)'
     """
     models = state_spaces(systems, labels)
     discrete = {model.is_discrete for model in models.values()}
@@ -145,27 +151,34 @@ def mode_frequencies(
     name: str | None = None,
     axes: Any = None,
 ) -> np.ndarray:
-    """Natural frequencies of the oscillatory modes over the scheduling κ.
+    """Natural frequencies of the oscillatory modes over the scheduling.
 
-    **Arguments**
+    Args:
+        systems: one, or a mapping from label to one, of: an `LPVStateSpace` (a line over its
+            range); a list of local models or results at `kappas` (dots); a function from the
+            scheduling to a `StateSpace` (a dashed black line, for an analytic reference).
+        kappas: where the local models are, (n_points,) or (n_points, n_scheduling); also the range
+            of a function.
+        labels: one for each system of a sequence of systems.
+        damping: add a panel with the damping ratios.
+        along: which scheduling variable is drawn; the others stay in the middle of their range.
+        name: of the scheduling variable, "κ" by default.
+        axes: where to draw, as many as returned; new ones by default.
 
-    - `systems`: one, or a mapping label → one, of: an `LPVStateSpace` (a line over its range);
-      a list of local models or results at `kappas` (dots); a function κ → `StateSpace` (a dashed
-      black line, for an analytic reference).
-    - `kappas`: where the local models are, shape (n_points,) or (n_points, n_scheduling); also
-      the range of a function.
-    - `labels`: one for each system of a sequence of systems.
-    - `damping`: add a panel with the damping ratios.
-    - `along`: which scheduling variable is drawn; the others stay in the middle of their range.
-    - `name`: of the scheduling variable, "κ" by default.
+    Returns:
+        The axes, shape (1,), or (2,) with damping.
 
-    Returns the axes, shape (1,), or (2,) with damping.
+    Raises:
+        ValueError: `kappas` is missing or has another length than the local models.
 
-    Raises `ValueError` where `kappas` is missing or has another length than the local models.
-
-    **Example**
-
-        mode_frequencies({"local": local, "LPV": lpv, "physics": arm.frozen_model}, kappas)
+    Example:
+        >>> from lpvid.models import StateSpace
+        >>> from lpvid.plot import mode_frequencies
+        >>> def spring(stiffness):
+        ...     return StateSpace([[0.0, 1.0], [-stiffness, -0.1]], [[0.0], [1.0]], [[1.0, 0.0]])
+        >>> systems = {"local": [spring(1.0), spring(4.0)], "physics": spring}
+        >>> mode_frequencies(systems, [1.0, 4.0], damping=True).shape
+        (2,)
     """
     points = None if kappas is None else np.asarray(kappas, float)
     points = points[:, None] if points is not None and points.ndim == 1 else points
@@ -200,7 +213,7 @@ def mode_frequencies(
 def _along_kappa(
     system: Any, label: str, points: np.ndarray | None, along: int, index: int
 ) -> tuple[np.ndarray, list[NDArray[np.complex128]], dict[str, Any]]:
-    """κ, the poles there (rad/s), and how they are drawn."""
+    """Scheduling, the poles there (rad/s), and how they are drawn."""
     if isinstance(system, LPVStateSpace):
         low, high = np.asarray(system.kappa_low), np.asarray(system.kappa_high)
         grid = _line(low, high, along)

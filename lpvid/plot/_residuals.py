@@ -36,17 +36,27 @@ def residuals(
     The band of the autocorrelation holds 95 % of the lags of white noise (±1.96 / √N). The
     spectrum (Welch) is that of the residual beside that of the measured output.
 
-    **Arguments**
+    Args:
+        y: measured output of one record, (time,) or (time, ny).
+        y_hat: simulated output, same shape.
+        dt: sample time in seconds.
+        names: one for each output; y1, y2, ... by default.
+        units: one for each output; none by default.
+        lags: how many lags are shown, from 1, at most half the record.
+        axes: where to draw, as many as returned; new ones by default.
 
-    - `y`, `y_hat`: measured and simulated, shape (time,) or (time, ny), one record.
-    - `dt`: sample time in seconds.
-    - `lags`: how many lags are shown, from 1, at most half the record.
+    Returns:
+        The axes, shape (ny, 3).
 
-    Returns the axes, shape (ny, 3).
+    Raises:
+        ValueError: shapes that differ, or names, units or axes that do not fit.
 
-    **Example**
-
-        residuals(test.y, model.simulate(u=test.u), test.dt)
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.plot import residuals
+        >>> y = np.random.default_rng(0).standard_normal(200)
+        >>> residuals(y, np.zeros(200), 0.1).shape
+        (1, 3)
     """
     measured, simulated = np.asarray(y, float), np.asarray(y_hat, float)
     if measured.shape != simulated.shape or measured.ndim not in (1, 2):

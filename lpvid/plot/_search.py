@@ -28,11 +28,18 @@ _MOST_NUMBERED_BARS = 16
 def scree(fit: Any, order: int | None = None, *, axes: Axes | None = None) -> Axes:
     """Singular values of an identification, those kept by the order filled.
 
-    `fit` is a `Fit`, or an array of singular values with `order`.
+    Args:
+        fit: a `Fit`, or an array of singular values.
+        order: how many are kept; that of the `Fit` by default.
+        axes: where to draw; new ones by default.
 
-    **Example**
+    Raises:
+        ValueError: more than one row of singular values.
 
-        scree(fit)
+    Example:
+        >>> from lpvid.plot import scree
+        >>> scree([10.0, 4.0, 1e-3, 1e-4], order=2).get_yscale()
+        'log'
     """
     values = np.asarray(getattr(fit, "singular_values", fit), float)
     if values.ndim != 1:
@@ -75,11 +82,28 @@ def minima(
     """Cost that each start of a restructuring ended with, sorted; hits of the best are filled.
 
     A flat foot is a minimum that many starts agree on; one lonely point at the bottom is a reason
-    to ask for more starts. `restructured` is one result, a sequence, or a mapping label → result.
+    to ask for more starts.
 
-    **Example**
+    Args:
+        restructured: one result of `restructure`, a sequence, or a mapping from label to result.
+        labels: one for each result of a sequence.
+        axes: where to draw; new ones by default.
 
-        minima(best)
+    Raises:
+        ValueError: no results, or labels that do not fit.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> from lpvid.models import FunctionStructure, StateSpace
+        >>> from lpvid.plot import minima
+        >>> from lpvid.restructure import HinfMatching, restructure
+        >>> black_box = StateSpace([[-2.0]], [[4.0]], [[0.5]])
+        >>> lag = FunctionStructure(lambda p: (-p[:1, None], p[:1, None], jnp.eye(1)), nominal=1.0)
+        >>> match = HinfMatching(passes=0)
+        >>> best = restructure(black_box, lag, starts=2, key=jax.random.key(0), method=match)
+        >>> minima(best).get_ylabel()
+        'match cost'
     """
     found = labelled(restructured, labels, "restructured", "starts")
     panel = grid_of_axes(1, 1, axes, size=(5.5, 3.4))[0, 0]
@@ -127,17 +151,24 @@ def fit_over_points(
 ) -> np.ndarray:
     """Bars of a fit measure for each operating point and model, one panel for each output.
 
-    **Arguments**
+    Args:
+        table: mapping from a model's label to its values, (n_points,) or (n_points, ny).
+        points: names or values of the operating points; 1, 2, ... by default.
+        output_names: one for each output; y1, y2, ... by default.
+        measure: label of the vertical axis.
+        axes: where to draw, one for each output; new ones by default.
 
-    - `table`: label of a model → its values, shape (n_points,) or (n_points, ny).
-    - `points`: names or values of the operating points; 1, 2, … by default.
-    - `measure`: label of the vertical axis.
+    Returns:
+        The axes, shape (ny,).
 
-    Returns the axes, shape (ny,). Raises `ValueError` where the models' shapes differ.
+    Raises:
+        ValueError: the models' shapes differ, or names, points or axes do not fit.
 
-    **Example**
-
-        fit_over_points({"black box": bft_black, "structured": bft_structured}, points=kappas)
+    Example:
+        >>> from lpvid.plot import fit_over_points
+        >>> table = {"black box": [99.1, 98.7], "structured": [98.9, 98.2]}
+        >>> fit_over_points(table, points=["arm bent", "arm straight"]).shape
+        (1,)
     """
     values = {}
     for label, row in labelled(table, None, "table", "model").items():

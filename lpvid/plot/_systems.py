@@ -17,7 +17,11 @@ _BLOCK = 256
 
 
 def state_spaces(systems: Any, labels: Sequence[str] | str | None) -> dict[str, StateSpace]:
-    """Label → model of one system, a sequence or a mapping; results give their model."""
+    """One system, a sequence or a mapping as a mapping from label to model; results give theirs.
+
+    Raises:
+        ValueError: something that is no state-space model, or labels that do not fit.
+    """
     models = {}
     for label, item in labelled(systems, labels, "systems", "system").items():
         model = model_of(item)
@@ -31,7 +35,7 @@ def state_spaces(systems: Any, labels: Sequence[str] | str | None) -> dict[str, 
 
 
 def plane_poles(model: StateSpace) -> NDArray[np.complex128]:
-    """Poles in s or z, shape (…, nx)."""
+    """Poles in s or z, (..., nx)."""
     return np.linalg.eigvals(np.asarray(model.A)).astype(np.complex128)
 
 

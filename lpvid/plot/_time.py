@@ -29,11 +29,23 @@ def records(data: IOData, *, axes: Any = None) -> np.ndarray:
 
     Several records follow one another, with a line between them.
 
-    Returns the axes, shape (nu + ny + nk,), inputs first.
+    Args:
+        data: one or several records.
+        axes: where to draw, one for each channel; new ones by default.
 
-    **Example**
+    Returns:
+        The axes, shape (nu + ny + nk,), inputs first.
 
-        records(data)
+    Raises:
+        ValueError: another number of axes than channels.
+
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData
+        >>> from lpvid.plot import records
+        >>> t = 0.01 * np.arange(200)
+        >>> records(IOData(u=np.sin(t), y=np.cos(t), kappa=0.3, dt=0.01)).shape
+        (3,)
     """
     groups = [
         (data.u, data.input_names, data.input_units, colour(0), "input"),
@@ -72,23 +84,32 @@ def compare(
 ) -> np.ndarray:
     """Measured outputs beside simulated ones, with their residuals below.
 
-    **Arguments**
-
-    - `models`: one or several (a sequence, or a mapping label → model) of: models (`StateSpace`,
-      `LPVStateSpace`) and results that hold one, simulated from rest record by record; outputs
-      simulated already, shape (time, ny).
-    - `labels`: one for each model of a sequence.
-
     The legend gives the best fit rate (BFT) over all records in percent.
 
-    Returns the axes, shape (ny, 2): measured and simulated, residual.
+    Args:
+        data: one or several records.
+        models: one or several (a sequence, or a mapping from label to model) of: models
+            (`StateSpace`, `LPVStateSpace`) and results that hold one, simulated from rest record by
+            record; outputs simulated already, (time, ny).
+        labels: one for each model of a sequence.
+        axes: where to draw, two for each output; new ones by default.
 
-    Raises `ValueError` where an output has another shape than the measured one, or an LPV model
-    meets data without scheduling.
+    Returns:
+        The axes, shape (ny, 2): measured and simulated, residual.
 
-    **Example**
+    Raises:
+        ValueError: an output has another shape than the measured one, or an LPV model meets data
+            without scheduling.
 
-        compare(test, {"identified": fit.model, "structured": best.model})
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData
+        >>> from lpvid.models import StateSpace
+        >>> from lpvid.plot import compare
+        >>> u = np.sin(0.01 * np.arange(200))
+        >>> lag = StateSpace([[-5.0]], [[5.0]], [[1.0]]).discretise(0.01)
+        >>> compare(IOData(u=u, y=u, dt=0.01), {"lag": lag}).shape
+        (1, 2)
     """
     outputs = {
         label: _simulated(data, model, label)

@@ -137,6 +137,7 @@ def test_without_passes_the_match_is_left_as_it_is(reduced):
 # --- other structures and targets
 
 
+@pytest.mark.slow
 def test_a_modal_model_is_recovered_from_a_random_basis():
     structure = ModalStructure(2, n_inputs=1, n_outputs=1)
     truth = structure.parameters_of(TWO_MODES)
@@ -147,6 +148,7 @@ def test_a_modal_model_is_recovered_from_a_random_basis():
     assert best.error_norm < 1e-8
 
 
+@pytest.mark.slow
 def test_black_boxes_of_another_order_are_matched():
     # One second-order plant, seen as one of order 3 with a weak real pole.
     plant = ONE_MODE.matrices(jnp.array([np.log(5.0), np.log(0.2), 1.0, 0.5]))
