@@ -11,8 +11,6 @@ import os
 
 # One BLAS thread, before anything loads a BLAS.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# jaxlib 0.10 deadlocks where as many batched LAPACK calls run at once as there are threads.
-os.environ.setdefault("NPROC", str(max(32, os.cpu_count() or 1)))
 
 import argparse
 import dataclasses

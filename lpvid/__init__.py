@@ -1,9 +1,8 @@
 """Differentiable system identification and linear parameter-varying (LPV) modelling."""
 
-import jax as _jax
+from lpvid import _runtime
 
-# Identification squares condition numbers: everything here is float64, asked for once, now.
-_jax.config.update("jax_enable_x64", True)
+_runtime.configure()
 
 __version__ = "0.1.0"
 
@@ -15,6 +14,7 @@ from lpvid import plot as plot
 from lpvid import study as study
 from lpvid._results import Status as Status
 from lpvid.analysis import HinfNorm as HinfNorm
+from lpvid.analysis import band_fit as band_fit
 from lpvid.analysis import bft as bft
 from lpvid.analysis import h2_norm as h2_norm
 from lpvid.analysis import hinf_norm as hinf_norm
@@ -28,6 +28,7 @@ from lpvid.data import Detrend as Detrend
 from lpvid.data import IOData as IOData
 from lpvid.data import Lowpass as Lowpass
 from lpvid.data import Offset as Offset
+from lpvid.data import PeriodicBand as PeriodicBand
 from lpvid.data import Scale as Scale
 from lpvid.data import from_pandas as from_pandas
 from lpvid.data import join as join

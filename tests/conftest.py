@@ -12,8 +12,9 @@ from jaxtyping import install_import_hook
 
 _hook = install_import_hook("lpvid", "beartype.beartype")
 
-import lpvid  # noqa: E402, F401
 import pytest  # noqa: E402
+
+import lpvid  # noqa: E402, F401
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")

@@ -21,8 +21,9 @@ def bft(y: ArrayLike, y_hat: ArrayLike) -> Float[Array, "*output"]:
         ValueError: shapes differ, or are not (time,) or (time, ny).
 
     Example:
+        >>> import numpy as np
         >>> from lpvid.analysis import bft
-        >>> bft([0.0, 1.0, 2.0], [0.0, 1.0, 2.0]).item()
+        >>> bft(np.arange(3.0), np.arange(3.0)).item()
         100.0
     """
     return jnp.maximum(nrmse_fit(y, y_hat), 0.0)
@@ -45,8 +46,9 @@ def nrmse_fit(y: ArrayLike, y_hat: ArrayLike) -> Float[Array, "*output"]:
         ValueError: shapes differ, or are not (time,) or (time, ny).
 
     Example:
+        >>> import numpy as np
         >>> from lpvid.analysis import nrmse_fit
-        >>> nrmse_fit([0.0, 2.0], [1.0, 1.0]).item()
+        >>> nrmse_fit(np.array([0.0, 2.0]), np.ones(2)).item()
         0.0
     """
     y, y_hat = _pair(y, y_hat, "y", "y_hat")
@@ -71,8 +73,9 @@ def vaf(y: ArrayLike, y_hat: ArrayLike) -> Float[Array, "*output"]:
         ValueError: shapes differ, or are not (time,) or (time, ny).
 
     Example:
+        >>> import numpy as np
         >>> from lpvid.analysis import vaf
-        >>> vaf([0.0, 1.0], [5.0, 6.0]).item()
+        >>> vaf(np.array([0.0, 1.0]), np.array([5.0, 6.0])).item()
         100.0
     """
     y, y_hat = _pair(y, y_hat, "y", "y_hat")
@@ -97,8 +100,9 @@ def relative_error(y: ArrayLike, y_hat: ArrayLike) -> Float[Array, "*output"]:
         ValueError: shapes differ, or are not (time,) or (time, ny).
 
     Example:
+        >>> import numpy as np
         >>> from lpvid.analysis import relative_error
-        >>> relative_error([3.0, 4.0], [3.0, 4.0]).item()
+        >>> relative_error(np.array([3.0, 4.0]), np.array([3.0, 4.0])).item()
         0.0
     """
     y, y_hat = _pair(y, y_hat, "y", "y_hat")
@@ -122,8 +126,9 @@ def parameter_fit(eta: ArrayLike, eta_hat: ArrayLike) -> Float[Array, "*paramete
         ValueError: shapes differ, or have more than two axes.
 
     Example:
+        >>> import numpy as np
         >>> from lpvid.analysis import parameter_fit
-        >>> parameter_fit([1.0, 3.0], [1.0, 3.0]).item()
+        >>> parameter_fit(np.array([1.0, 3.0]), np.array([1.0, 3.0])).item()
         100.0
     """
     eta, eta_hat = _pair(eta, eta_hat, "eta", "eta_hat")

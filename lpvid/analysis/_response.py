@@ -22,9 +22,10 @@ def singular_values(system: StateSpace, omega: ArrayLike) -> Float[Array, "*batc
         ValueError: omega has more than one axis.
 
     Example:
+        >>> import numpy as np
         >>> from lpvid.analysis import singular_values
         >>> from lpvid.models import StateSpace
-        >>> singular_values(StateSpace([[-1.0]], [[1.0]], [[2.0]]), [0.0]).item()
+        >>> singular_values(StateSpace([[-1.0]], [[1.0]], [[2.0]]), np.zeros(1)).item()
         2.0
     """
     frequencies = jnp.atleast_1d(jnp.asarray(omega, float))

@@ -5,7 +5,7 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.signal
+import scipy  # its parts load when first used
 from jaxtyping import Array, Float
 
 from lpvid.data._io_data import IOData

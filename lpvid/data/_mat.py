@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
+import scipy  # its parts load when first used
 
 from lpvid.data._arrays import read_arrays
 from lpvid.data._assemble import Columns

@@ -191,7 +191,7 @@ class ModalStructure(AbstractStructure):
         A = np.diag(poles[keep])
         T = np.zeros((len(keep), len(keep)), complex)
         for k in range(0, len(keep), 2):
-            complex_pair = abs(poles[keep[k]].imag) > 0
+            complex_pair = np.imag(poles[keep[k]]) != 0
             T[k : k + 2, k : k + 2] = [[1, 1j], [1, -1j]] if complex_pair else np.eye(2)
         inverse = np.linalg.inv(T)
         return StateSpace(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.signal
+import scipy  # its parts load when first used
 
 from lpvid.plot._figure import (
     DATA_COLOUR,

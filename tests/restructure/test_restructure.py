@@ -115,7 +115,6 @@ def test_the_minimax_solution_is_scipys(reduced, dense_errors):
     found = []
     for trial in range(6):
         start = centre + (0.0 if trial == 0 else 0.3) * rng.normal(size=4)
-        # Epigraph form of the minimax problem, smooth, by SLSQP; then a simplex on the norm.
         result = scipy.optimize.minimize(
             lambda p: np.max(dense_errors(p)),
             start,
