@@ -54,8 +54,15 @@ def styled(draw: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]
     def wrapped(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         import matplotlib
 
-        with matplotlib.rc_context(_STYLE):
+        # Not `rc_context`: it would also take back what a notebook's backend sets with its first
+        # figure, and no later figure would be shown.
+        settings = matplotlib.rcParams
+        before = {name: settings[name] for name in _STYLE}
+        settings.update(_STYLE)
+        try:
             return draw(*args, **kwargs)
+        finally:
+            settings.update(before)
 
     return wrapped
 

@@ -98,3 +98,24 @@ def test_labels_must_fit(oscillator, labels, message):
 def test_labels_beside_a_mapping(oscillator):
     with pytest.raises(ValueError, match="has its own"):
         lpvid.plot.poles({"a": oscillator}, ["b"])
+
+
+def test_settings_made_while_drawing_stay_and_the_style_does_not():
+    import matplotlib
+
+    from lpvid.plot._figure import styled
+
+    before = matplotlib.rcParams["interactive"], matplotlib.rcParams["font.size"]
+
+    @styled
+    def draw():
+        # As a notebook's backend does with its first figure.
+        matplotlib.rcParams["interactive"] = not before[0]
+        return matplotlib.rcParams["font.size"]
+
+    try:
+        assert draw() == 9.0
+        assert matplotlib.rcParams["interactive"] is not before[0]
+        assert matplotlib.rcParams["font.size"] == before[1]
+    finally:
+        matplotlib.rcParams["interactive"] = before[0]
