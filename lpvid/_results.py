@@ -29,6 +29,10 @@ class Status(eqx.Enumeration):
         "The estimated model is unstable. Ask for stabilisation, lower the order, or use "
         "past outputs as instruments."
     )
+    poor_match = (
+        "The structured model is no closer to the black box than no model at all. Give more or "
+        "better starts, another structure, or a black box that is stable."
+    )
     infinite_norm = (
         "The system has a pole on the stability boundary, so its norm is infinite. Remove the "
         "marginal mode or add damping."

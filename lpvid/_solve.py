@@ -1,7 +1,7 @@
 """Minimisation: the one place that calls optimistix and jaxopt.
 
-Adds to them what every problem here needs: bounds (by a change of variables), the best point
-seen, one status enumeration, and several starts at once.
+Adds to them what every problem here needs: bounds (by a change of variables), never a worse point
+than the start, and one status enumeration. Several starts go through `jax.vmap`.
 """
 
 import warnings
@@ -157,7 +157,7 @@ def minimise(
     value, state = solver.run(start)
     cost, first = loss(value), loss(start)
     # A line search that fails may leave a worse point than it came from.
-    better = jnp.isfinite(cost) & (cost <= first)
+    better = jnp.isfinite(cost) & ((cost <= first) | ~jnp.isfinite(first))
     value = jnp.where(better, value, start)
     cost = jnp.where(better, cost, first)
     ended = Status.where(state.error <= tolerance, Status.successful, Status.max_steps)

@@ -275,6 +275,11 @@ def _fit(basis, points, parameters, weights) -> Float[Array, "basis parameter"]:
     return jnp.linalg.lstsq(basis(points) * root, parameters * root)[0]
 
 
+def _differ(first: AbstractStructure, second: AbstractStructure) -> bool:
+    same = eqx.tree_equal(first, second)
+    return not (isinstance(same, Tracer) or bool(same))
+
+
 def _local_parameters(models) -> tuple[AbstractStructure, Float[Array, "point parameter"]]:
     if not models:
         raise ValueError("models: none given.")
@@ -283,7 +288,7 @@ def _local_parameters(models) -> tuple[AbstractStructure, Float[Array, "point pa
         raise ValueError("models: results of restructure and state-space models do not mix.")
     if isinstance(first, Restructured):
         structure = first.structure
-        if any(jax.tree.structure(m.structure) != jax.tree.structure(structure) for m in models):
+        if any(_differ(m.structure, structure) for m in models):
             raise ValueError("models: all must have been restructured to the same structure.")
         parameters = jnp.stack([m.parameters for m in models])
     else:

@@ -12,7 +12,13 @@ from lpvid._results import Status
 from lpvid.commands._cache import keep_compiled_code
 from lpvid.commands._messages import Warnings
 from lpvid.commands._output import check_targets, plain, write_json
-from lpvid.commands._records import check_columns, make_method, read_records, without_offsets
+from lpvid.commands._records import (
+    check_columns,
+    make_method,
+    offsets_of,
+    read_records,
+    without_offsets,
+)
 from lpvid.identify import Fit, identify, simulation_fit
 from lpvid.io import save
 from lpvid.models import StateSpace
@@ -54,7 +60,7 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
             "stable": stable,
             "poles": poles_of(fit.model),
             "singular_values": fit.singular_values,
-            "offsets": None if offset is None else {"u": offset.u, "y": offset.y},
+            "offsets": offsets_of(offset),
             "fit": scores,
             "status": Status[fit.status],
             "poles_moved": int(fit.stats["eigenvalues_moved"]),
@@ -96,7 +102,10 @@ def _print(
     offsets_removed: bool,
 ) -> None:
     if offsets_removed:
-        print("Offsets: each channel's mean over the fitted part was taken out of both parts.")
+        print(
+            "Offsets: each channel's mean over the fitted part was taken out of both parts.\n"
+            "The model is for signals with these means taken out (--json lists them)."
+        )
     state = "stable" if stable else "UNSTABLE"
     print(f"Order {fit.order}, {arguments.method}, {state}.\n")
     rows = [

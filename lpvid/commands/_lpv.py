@@ -1,24 +1,31 @@
 """`lpvid lpv`: local models at operating points, restructured, interpolated, tested."""
 
 import argparse
+import itertools
 import math
 import time
-import warnings as python_warnings
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from lpvid import __version__
-from lpvid._results import Status
+from lpvid._results import Status, is_successful
 from lpvid.analysis import hinf_norm
 from lpvid.commands._cache import keep_compiled_code
 from lpvid.commands._errors import UsageError
 from lpvid.commands._identify import poles_of
+from lpvid.commands._lpv_tables import print_all, written
 from lpvid.commands._messages import Warnings, say
-from lpvid.commands._output import check_targets, plain, write_json
-from lpvid.commands._records import check_columns, make_method, read_records, without_offsets
-from lpvid.data import IOData, join
+from lpvid.commands._output import check_targets, write_json
+from lpvid.commands._records import (
+    check_columns,
+    make_method,
+    offsets_of,
+    read_records,
+    without_offsets,
+)
+from lpvid.data import IOData, Offset, join
 from lpvid.identify import Fit, identify, simulation_fit
 from lpvid.interpolate import interpolate, leave_one_out
 from lpvid.io import save
@@ -30,15 +37,18 @@ from lpvid.models import (
     ModalStructure,
     Polynomial,
     StateSpace,
-    Tustin,
     align,
     balance,
     d2c,
+    polynomial_basis,
 )
-from lpvid.report import text_table
 from lpvid.restructure import Restructured, restructure_along
 
 _ARM_ORDER = 6
+# Between two ends; local models that are stable may be joined by ones that are not.
+_FROZEN = 33
+# Predicted responses further off than this do not come from one smooth family.
+_LARGEST_MISS = 0.3
 
 
 class _Point(NamedTuple):
@@ -47,12 +57,13 @@ class _Point(NamedTuple):
     kappa: tuple[float, ...]
     files: list[str]
     data: IOData
+    offset: Offset | None
     fit: Fit
     continuous: StateSpace
 
     @property
     def name(self) -> str:
-        return _written(self.kappa)
+        return written(self.kappa)
 
 
 class _Test(NamedTuple):
@@ -62,6 +73,7 @@ class _Test(NamedTuple):
     file: str
     kappa: tuple[float, ...] | None
     data: IOData
+    offset: Offset | None
 
 
 def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
@@ -74,15 +86,31 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
     tests = _read_tests(arguments, records, len(next(iter(groups))))
     points = []
     for kappa, files in groups.items():
-        say(f"Identifying at K = {_written(kappa)}")
-        points.append(_identify(arguments, kappa, files, records[kappa]))
+        say(f"Identifying at K = {written(kappa)}")
+        with warnings.about(f"K = {written(kappa)}"):
+            points.append(_identify(arguments, kappa, files, records[kappa], warnings))
     structure = _structure(arguments, points[0].fit.model)
     say("Restructuring" if structure else "Aligning the black boxes")
     models = _local_models(arguments, structure, points)
+    for point, model in zip(points, models, strict=True):
+        if isinstance(model, Restructured) and not bool(is_successful(model.status)):
+            warnings.add(f"K = {point.name}: restructured, but: {Status[model.status]}")
     kappas = np.array([point.kappa for point in points])
     say("Interpolating and testing")
     errors = leave_one_out(models, kappas)
+    if max(errors) > 0 and not min(errors.values()) <= _LARGEST_MISS:
+        warnings.add(
+            f"The local models do not form a smooth family in K: predicted from the others, a "
+            f"point's response is {100.0 * min(errors.values()):.3g} % off at best. Modes may "
+            "cross, or the order may be wrong."
+        )
     lpv = interpolate(models, kappas, Polynomial(degree=arguments.degree))
+    unstable_at = _unstable_at(lpv, kappas)
+    if unstable_at is not None:
+        warnings.add(
+            f"K = {written(unstable_at)}: the LPV model frozen there is unstable. Try another "
+            "--degree or --order, or add operating points."
+        )
     content: dict[str, Any] = {
         "command": "lpv",
         "version": __version__,
@@ -97,10 +125,11 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
         ],
         "degree": max(sum(powers) for powers in lpv.basis.exponents),
         "leave_one_out": errors,
+        "stable_over_range": unstable_at is None,
         "parameter_names": lpv.structure.parameter_names,
         "test": [_test_content(test, lpv, points) for test in tests],
     }
-    _print(arguments, content, [point.name for point in points])
+    print_all(arguments, content, [point.name for point in points])
     if arguments.out is not None:
         save(arguments.out, lpv)
         print(f"\nModel saved to {arguments.out}")
@@ -133,15 +162,12 @@ def _numbers(text: str) -> tuple[float, ...] | None:
     return values if all(math.isfinite(value) for value in values) else None
 
 
-def _written(kappa: tuple[float, ...]) -> str:
-    return ",".join(f"{value:.6g}" for value in kappa)
-
-
 def _check(arguments: argparse.Namespace, groups: dict[tuple[float, ...], list[str]]) -> None:
     check_columns(arguments)
     sources = [file for files in groups.values() for file in files]
     sources += [file for _, file in arguments.test]
     check_targets({"--out": arguments.out, "--json": arguments.json}, sources)
+    _check_degree(arguments.degree, np.array(list(groups)))
     name, order = arguments.structure, arguments.order
     if (arguments.lengths is not None) != (name == "two-link-arm"):
         needed = "needs" if arguments.lengths is None else "is for"
@@ -161,6 +187,24 @@ def _check(arguments: argparse.Namespace, groups: dict[tuple[float, ...], list[s
         raise UsageError(
             f"--order: the structure mechanical has one input and one output a degree of freedom, "
             f"{order // 2} for order {order}"
+        )
+
+
+def _check_degree(degree: int | str, kappas: np.ndarray) -> None:
+    if isinstance(degree, str):
+        return
+    count, width = kappas.shape
+    # Monomials of that total degree at most.
+    needed = math.comb(width + degree, degree)
+    if count < needed:
+        raise UsageError(
+            f"--degree: {degree} in {width} scheduling variable(s) needs {needed} distinct points "
+            f"--at, {count} given; lower it or add operating points"
+        )
+    if np.linalg.matrix_rank(np.asarray(polynomial_basis(kappas, degree)(kappas))) < needed:
+        raise UsageError(
+            f"--degree: {degree} needs {needed} points --at that do not all lie on a curve of this "
+            "degree; lower it or add operating points"
         )
 
 
@@ -191,25 +235,36 @@ def _read_tests(
             raise UsageError(
                 f"{file}: the sample time is {data.dt:g} s, but the records of --at have {dt:g} s"
             )
-        _, (data,) = without_offsets(arguments, data.replace(dt=dt))
-        tests.append(_Test(text.strip(), file, kappa, data))
+        offset, (data,) = without_offsets(arguments, data.replace(dt=dt))
+        tests.append(_Test(text.strip(), file, kappa, data, offset))
     return tests
 
 
 def _identify(
-    arguments: argparse.Namespace, kappa: tuple[float, ...], files: list[str], data: IOData
+    arguments: argparse.Namespace,
+    kappa: tuple[float, ...],
+    files: list[str],
+    data: IOData,
+    warnings: Warnings,
 ) -> _Point:
-    _, (data,) = without_offsets(arguments, data)
+    offset, (data,) = without_offsets(arguments, data)
     try:
         fit = identify(data, make_method(arguments))
     except ValueError as error:
-        raise UsageError(f"at K = {_written(kappa)}: {error}") from error
+        raise UsageError(f"at K = {written(kappa)}: {error}") from error
+    # Of an ill-conditioned fit, `identify` says only that.
+    if not bool(fit.model.is_stable()) and not bool(fit.status == Status.unstable):
+        warnings.add("the model is not stable; ask for --stabilise, or another --order")
     try:
         continuous = d2c(fit.model)
     except ValueError as error:
-        python_warnings.warn(f"at K = {_written(kappa)}: {error} Tustin's is used.", stacklevel=2)
-        continuous = d2c(fit.model, Tustin())
-    return _Point(kappa, files, data, fit, continuous)
+        # No other rule for one point alone: the parameters would not be those of its neighbours.
+        raise UsageError(
+            f"at K = {written(kappa)}: the model has a pole on the negative real axis of z, so "
+            f"none in continuous time gives it at dt = {data.dt:g} s; ask for another --order or "
+            "--block-rows, or record with a smaller sample time"
+        ) from error
+    return _Point(kappa, files, data, offset, fit, continuous)
 
 
 def _structure(arguments: argparse.Namespace, model: StateSpace) -> AbstractStructure | None:
@@ -245,6 +300,19 @@ def _local_models(
     return aligned
 
 
+def _unstable_at(lpv: LPVStateSpace, kappas: np.ndarray) -> tuple[float, ...] | None:
+    """The first κ within the range at which the frozen model is unstable."""
+    if lpv.n_scheduling == 1:
+        between = np.linspace(kappas.min(axis=0), kappas.max(axis=0), _FROZEN)
+    else:
+        # Not over the whole box: its corners may be far from every point.
+        pairs = itertools.combinations(kappas, 2)
+        between = np.array([(first + second) / 2.0 for first, second in pairs])
+    grid = np.unique(np.concatenate([kappas, between]), axis=0)
+    unstable = grid[~np.asarray(lpv.is_stable(grid))]
+    return tuple(unstable[0].tolist()) if len(unstable) else None
+
+
 def _point_content(
     point: _Point, model: Restructured | StateSpace, lpv: LPVStateSpace
 ) -> dict[str, Any]:
@@ -254,7 +322,8 @@ def _point_content(
         "files": point.files,
         "samples": point.data.lengths,
         "stable": bool(point.fit.model.is_stable()),
-        "status": Status[point.fit.status],
+        "fit_status": Status[point.fit.status],
+        "offsets": offsets_of(point.offset),
         "poles": poles_of(point.fit.model),
         "fit": simulation_fit(point.fit.model, point.data),
         "fit_lpv": simulation_fit(frozen, point.data),
@@ -262,6 +331,7 @@ def _point_content(
     if isinstance(model, Restructured):
         norm = float(hinf_norm(point.continuous).value)
         content |= {
+            "status": Status[model.status],
             "cost": float(model.cost),
             "error_norm": float(model.error_norm),
             "relative_error": float(model.error_norm) / norm,
@@ -278,46 +348,7 @@ def _test_content(test: _Test, lpv: LPVStateSpace, points: list[_Point]) -> dict
     return {
         "kappa": test.asked if test.kappa is None else test.kappa,
         "file": test.file,
+        "offsets": offsets_of(test.offset),
         "lpv": simulation_fit(model, test.data),
         "local": {point.name: simulation_fit(point.fit.model, test.data) for point in points},
     }
-
-
-def _print(arguments: argparse.Namespace, content: dict[str, Any], names: list[str]) -> None:
-    print(
-        f"{len(names)} operating points, order {content['order']}, structure "
-        f"{content['structure']}, dt = {content['dt']:g} s"
-    )
-    if not arguments.keep_offsets:
-        print("Offsets: each channel's mean over each record, tests too, was taken out.")
-    rows = []
-    for name, point in zip(names, content["points"], strict=True):
-        # One error for all outputs together; black boxes are not restructured.
-        error = 100.0 * point["relative_error"] if "relative_error" in point else None
-        for k, output in enumerate(content["outputs"]):
-            first = k == 0
-            rows.append(
-                (
-                    name if first else "",
-                    output,
-                    plain(point["fit"][k]),
-                    plain(point["fit_lpv"][k]),
-                    error if first else None,
-                    ("yes" if point["stable"] else "NO") if first else "",
-                )
-            )
-    headers = ["K", "output", "BFT local (%)", "BFT LPV (%)", "H-inf error (%)", "stable"]
-    print("\n" + text_table(rows, headers))
-    table = [(degree, 100.0 * error) for degree, error in content["leave_one_out"].items()]
-    print("\n" + text_table(table, ["degree", "error, points left out (%)"]))
-    print(f"\nPolynomial of degree {content['degree']} in K.")
-    if content["test"]:
-        rows = []
-        for test in content["test"]:
-            asked = test["kappa"] if isinstance(test["kappa"], str) else _written(test["kappa"])
-            for k, output in enumerate(content["outputs"]):
-                local = [plain(fit[k]) for fit in test["local"].values()]
-                rows.append((asked if k == 0 else "", output, plain(test["lpv"][k]), *local))
-        headers = ["test K", "output", "LPV", *(f"local {name}" for name in names)]
-        print("\nBFT (%) on the test records, initial states estimated:\n")
-        print(text_table(rows, headers))

@@ -1,9 +1,11 @@
 """What is said on stderr: one line each, in the command line's own words."""
 
+import contextlib
 import re
 import sys
 import types
 import warnings
+from collections.abc import Iterator
 
 # The library speaks of its arguments; here they are options.
 _WORDS = (
@@ -15,6 +17,7 @@ _WORDS = (
     (r"\border=(?=\d)", "--order "),
     (r'\border="auto"', "--order auto"),
     (r"\bblock_rows\b", "--block-rows"),
+    (r"\buse past outputs as instruments\b", "use --method po-moesp"),
     (r"call the reader that fits, read_csv, read_mat or read_npz", "name it by its kind"),
     (r"data\.select\(inputs=\.\.\.\)", "another --input"),
     (r"data\.select\(outputs=\.\.\.\)", "another --output"),
@@ -39,6 +42,7 @@ class Warnings:
 
     def __init__(self, command: str):
         self.messages: list[str] = []
+        self._subject = ""
         self._command = command
         self._catcher = warnings.catch_warnings()
 
@@ -66,9 +70,18 @@ class Warnings:
         del category, filename, lineno, file, line
         self.add(str(message))
 
+    @contextlib.contextmanager
+    def about(self, subject: str) -> Iterator[None]:
+        """Warnings within begin with what they are about."""
+        self._subject = f"{subject}: "
+        try:
+            yield
+        finally:
+            self._subject = ""
+
     def add(self, message: str) -> None:
         """Say a warning of the command's own."""
-        text = in_command_words(message)
+        text = self._subject + in_command_words(message)
         if text not in self.messages:
             self.messages.append(text)
             say(f"{self._command}: warning: {text}")

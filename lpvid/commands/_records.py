@@ -3,6 +3,7 @@
 import argparse
 import os
 from collections.abc import Sequence
+from typing import Any
 
 from lpvid.commands._errors import UsageError
 from lpvid.data import IOData, Offset, preprocess, read
@@ -54,6 +55,11 @@ def without_offsets(
         return None, [data, *others]
     offset = Offset.mean_of(data)
     return offset, [preprocess(part, offset)[0] for part in (data, *others)]
+
+
+def offsets_of(offset: Offset | None) -> dict[str, Any] | None:
+    """The means that were taken out, one row a record, as the JSON files hold them."""
+    return None if offset is None else {"u": offset.u, "y": offset.y}
 
 
 def make_method(arguments: argparse.Namespace) -> AbstractSubspaceMethod:

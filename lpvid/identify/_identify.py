@@ -160,7 +160,7 @@ def identify(
     well = result.pop("successful")
     fit = _as_fit(result | {name: found[name] for name in _RANGE_STATS}, data)
     if not traced and not bool(well):
-        _report(fit, data, block_rows, negligible(route), throw)
+        _report(fit, data, method, block_rows, negligible(route), throw)
     return fit
 
 
@@ -273,14 +273,27 @@ def _free_unstable(
     return again | dict(x0=again["x0"][np.array(firsts)], window=jnp.asarray(window))
 
 
-def _report(fit: Fit, data: IOData, block_rows: int, rounding: float, throw: bool) -> None:
+def _report(
+    fit: Fit,
+    data: IOData,
+    method: AbstractSubspaceMethod,
+    block_rows: int,
+    rounding: float,
+    throw: bool,
+) -> None:
     """Raise or warn, with the channel and the remedy."""
     if fit.status == Status.unstable:
+        remedies = [
+            "Ask for stabilise=0.9999",
+            f"lower the order ({fit.order})",
+            f"raise block_rows ({block_rows})",
+        ]
+        if not method.past_outputs:
+            remedies.append("use past outputs as instruments")
         warnings.warn(
             f"The identified model is unstable (spectral radius "
-            f"{float(fit.stats['spectral_radius']):.6g}). Ask for stabilise=0.9999, lower the "
-            f"order ({fit.order}), raise block_rows ({block_rows}), or use past outputs as "
-            f"instruments.",
+            f"{float(fit.stats['spectral_radius']):.6g}). {', '.join(remedies[:-1])}, or "
+            f"{remedies[-1]}.",
             stacklevel=3,
         )
     elif fit.status == Status.ill_conditioned:

@@ -72,6 +72,17 @@ class LPVStateSpace(eqx.Module):
         self._warn_outside(point)
         return self.structure.matrices(self.parameters(point))
 
+    def is_stable(self, kappa: Numbers) -> Array:
+        """Whether the frozen model is stable at κ, shape (…, n_scheduling) → (…).
+
+        Stable local models do not make the models between them stable, unless the structure
+        does (modal, mechanical).
+        """
+        point = self._schedule(kappa)
+        flat = point.reshape(-1, self.n_scheduling)
+        frozen = jax.vmap(self.structure.matrices)(self.parameters(flat))
+        return frozen.is_stable().reshape(point.shape[:-1])
+
     def is_inside(self, kappa: Numbers) -> Array:
         """Whether κ (…, n_scheduling) lies within the box of the points it was built from."""
         point = self._schedule(kappa)

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy  # its parts load when first used
 from jaxtyping import Array, PRNGKeyArray
 
 from lpvid.models._state_space import StateSpace
@@ -18,14 +19,16 @@ class ModalStructure(AbstractStructure):
 
     Mode k has the block A_k = [[0, ω_k], [−ω_k, −2 ζ_k ω_k]], the input rows [0, 1] in the column
     of the reference input (which fixes the basis), free input rows in the other columns, and two
-    free columns in C: ω (c₁ s' + c₂)-shaped residues of any phase, so that every minimal model
-    with simple poles, all of them excited by the reference input, can be written this way. The
-    states are scaled so that displacement-like and velocity-like entries have one size.
+    free columns in C: ω (c₁ s' + c₂)-shaped residues of any phase, so that every stable minimal
+    model of even order with simple poles, all of them excited by the reference input, can be
+    written this way. The states are scaled so that displacement-like and velocity-like entries
+    have one size.
 
-    ϑ holds, mode after mode by rising frequency: log ω_k (ω in rad/s), log ζ_k, the 2·n_outputs
-    entries of C, the 2·(n_inputs − 1) free entries of B; last the entries of D if there is
-    `feedthrough`. With the logarithms every ϑ is a stable model, also between and beyond the
-    points of an interpolation; damping above one stands for two real poles.
+    ϑ holds, mode after mode: log ω_k (ω in rad/s), log ζ_k, the 2·n_outputs entries of C, the
+    2·(n_inputs − 1) free entries of B; last the entries of D if there is `feedthrough`. Starts
+    list the modes by rising frequency. With the logarithms every ϑ is a stable model, also
+    between and beyond the points of an interpolation; damping above one stands for two real
+    poles.
 
     Attributes:
         n_modes: second-order modes.
@@ -156,6 +159,24 @@ class ModalStructure(AbstractStructure):
         others = [j for j in range(self.n_inputs) if j != r]
         B = np.real(target_vectors @ (rows[order][:, others] / gain[:, None]))
         return np.concatenate([[np.log(frequency), np.log(damping)], C.ravel(), B.ravel()])
+
+    def align(self, parameters: Parameters, neighbour: Parameters) -> Parameters:
+        """The modes in the order of a neighbour's: by frequency, damping and shape (eager).
+
+        Sorted by frequency alone, modes that cross between two points would change places.
+        """
+        count = self.n_modes * self._per_mode
+        modes = np.asarray(parameters[:count]).reshape(self.n_modes, self._per_mode)
+        others = np.asarray(neighbour[:count]).reshape(self.n_modes, self._per_mode)
+        shapes, other_shapes = modes[:, 2:], others[:, 2:]
+        size = np.linalg.norm(shapes, axis=1)[:, None]
+        size = size + np.linalg.norm(other_shapes, axis=1)[None] + np.finfo(float).tiny
+        apart = np.linalg.norm(shapes[:, None] - other_shapes[None], axis=2) / size
+        frequency = np.abs(modes[:, None, 0] - others[None, :, 0])
+        damping = np.abs(modes[:, None, 1] - others[None, :, 1])
+        rows, columns = scipy.optimize.linear_sum_assignment(frequency + 0.1 * damping + apart)
+        order = rows[np.argsort(columns)]
+        return jnp.concatenate([jnp.asarray(modes[order].reshape(-1)), parameters[count:]])
 
     def starts(self, key: PRNGKeyArray, count: int, black_box: StateSpace) -> Starts:
         """The black box's own modes (reduced to the strongest n_modes), then scatter about them."""

@@ -69,6 +69,11 @@ class AbstractStructure(eqx.Module):
         """A better-behaved parameterisation to search in first (None: search in this one)."""
         return None
 
+    def align(self, parameters: Parameters, neighbour: Parameters) -> Parameters:
+        """The same model, listed as a neighbouring point's: for interchangeable parts (modes)."""
+        del neighbour
+        return parameters
+
     def from_search(self, parameters: Float[Array, " searched"]) -> Parameters:
         """Carry the parameters found in `search_structure()` over to this structure."""
         return parameters

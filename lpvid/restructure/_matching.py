@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from lpvid._results import Solution
+from lpvid._results import Solution, Status
 from lpvid._solve import Bounds, least_squares
-from lpvid.analysis import hinf_norm
+from lpvid.analysis import HinfNorm, hinf_norm
 from lpvid.models import AbstractStructure, StateSpace
 
 
@@ -43,14 +43,13 @@ def make_target(black_box: StateSpace, n_frequencies: int, highest: float) -> Ta
     return Target(omega, black_box.frequency_response(omega), black_box)
 
 
-def error_norm(structure: AbstractStructure, parameters: Array, target: Target):
-    """‖Σ(ϑ)‖∞ and the frequency it is reached at; over the grid where that is the target."""
+def error_norm(structure: AbstractStructure, parameters: Array, target: Target) -> HinfNorm:
+    """‖Σ(ϑ)‖∞ with its frequency and status; over the grid where that is the target."""
     if target.black_box is not None:
-        norm = hinf_norm(structure.matrices(parameters) - target.black_box)
-        return norm.value, norm.frequency
+        return hinf_norm(structure.matrices(parameters) - target.black_box)
     error = response_error(structure, parameters, target)
     gains = jnp.linalg.svd(error, compute_uv=False)[:, 0]
-    return jnp.max(gains), target.omega[jnp.argmax(gains)]
+    return HinfNorm(jnp.max(gains), target.omega[jnp.argmax(gains)], Status.successful)
 
 
 def response_error(

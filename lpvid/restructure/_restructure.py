@@ -9,10 +9,11 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
-from lpvid._results import Status
+from lpvid._results import Solution, Status
+from lpvid.analysis import HinfNorm
 from lpvid.models import AbstractStructure, StateSpace, d2c
 from lpvid.restructure._matching import Target, error_norm, make_target, match_from_starts
-from lpvid.restructure._surrogate import refine_smooth
+from lpvid.restructure._surrogate import largest_gain, refine_smooth
 
 # Two searches ended in the same minimum if their costs differ by less than this factor.
 _SAME_MINIMUM = 1.02
@@ -176,7 +177,8 @@ def restructure_along(
     """Restructure the local models along κ: each one alone, then again from its neighbours.
 
     A neighbour's solution replaces a point's own where it leads to a lower H∞ error, which mends
-    points whose starts all missed the global minimum. Not for `jit`: it decides point by point.
+    points whose starts all missed the global minimum. Parameters that a structure may list in any
+    order (modes) follow their neighbour's. Not for `jit`: it decides point by point.
 
     Args:
         black_boxes: models ordered along κ.
@@ -202,21 +204,33 @@ def restructure_along(
     """
     method = HinfMatching() if method is None else method
     keys = jax.random.split(key, len(black_boxes))
-    found = [
-        restructure(model, structure, starts=starts, key=point_key, omega=omega, method=method)
-        for model, point_key in zip(black_boxes, keys, strict=True)
-    ]
+    found = []
+    for index, (model, point_key) in enumerate(zip(black_boxes, keys, strict=True)):
+        try:
+            found.append(
+                restructure(
+                    model, structure, starts=starts, key=point_key, omega=omega, method=method
+                )
+            )
+        except ValueError as error:
+            raise ValueError(f"black_boxes[{index}]: {error}") from error
     if len(found) < 2:
         return found
     improved = []
     for index, (model, own) in enumerate(zip(black_boxes, found, strict=True)):
-        left, right = max(index - 1, 0), min(index + 1, len(found) - 1)
-        neighbours = jnp.stack([found[left].parameters, found[right].parameters])
-        again = restructure(
-            model, structure, starts=0, initial=neighbours, omega=omega, method=method
-        )
-        better = bool(again.error_norm < (1.0 - 1e-3) * own.error_norm)
-        improved.append(again if better else own)
+        left, right = found[max(index - 1, 0)], found[min(index + 1, len(found) - 1)]
+        neighbours = [r for r in (left, right) if bool(jnp.all(jnp.isfinite(r.parameters)))]
+        if not neighbours:
+            improved.append(own)
+            continue
+        # Always two: one compilation serves all points.
+        initial = jnp.stack([neighbours[0].parameters, neighbours[-1].parameters])
+        again = restructure(model, structure, starts=0, initial=initial, omega=omega, method=method)
+        worse = bool(again.error_norm >= (1.0 - 1e-3) * own.error_norm)
+        improved.append(own if worse else again)
+    for index in range(1, len(improved)):
+        aligned = structure.align(improved[index].parameters, improved[index - 1].parameters)
+        improved[index] = eqx.tree_at(lambda r: r.parameters, improved[index], aligned)
     return improved
 
 
@@ -237,30 +251,48 @@ def _run(target, structure, search, scattered, given, method) -> Restructured:
     matched = _match(structure, jnp.concatenate(candidates), target, method.match_steps)
     # Hits are counted where the search was made: the polished point is one more trial.
     costs = jnp.sort(matched.cost if costs is None else costs)
-    parameters = matched.value[jnp.argmin(matched.cost)]
-    norm, peak = error_norm(structure, parameters, target)
+    parameters, norm, peak = _lowest_norm(structure, matched, target)
     history = [norm]
     for _ in range(method.passes):
         descent = _descend(structure, parameters, target, peak[None], method)
-        moved_norm, moved_peak = error_norm(structure, descent.value, target)
-        ahead = jnp.isfinite(moved_norm) & (moved_norm < norm)
+        moved = error_norm(structure, descent.value, target)
+        ahead = jnp.isfinite(moved.value) & (moved.value < norm)
         parameters = jnp.where(ahead, descent.value, parameters)
         # The peak is kept in any case: it is what the last grid lacked.
-        norm, peak = jnp.where(ahead, moved_norm, norm), moved_peak
+        norm, peak = jnp.where(ahead, moved.value, norm), moved.frequency
         history.append(norm)
-    norm, peak = error_norm(structure, parameters, target)
+    final = error_norm(structure, parameters, target)
     same = costs <= _SAME_MINIMUM * costs[0] + 1e-16
     return Restructured(
         structure=structure,
         parameters=parameters,
-        error_norm=norm,
-        peak_frequency=peak,
+        error_norm=final.value,
+        peak_frequency=final.frequency,
         match_costs=costs,
         hits=jnp.sum(same),
         margin=jnp.min(jnp.where(same, jnp.inf, costs)) / jnp.maximum(costs[0], 1e-300),
         history=jnp.stack(history),
-        status=Status.where(jnp.isfinite(norm), Status.successful, Status.nonfinite),
+        status=_outcome(final, target),
     )
+
+
+def _lowest_norm(structure, matched: Solution, target):
+    """The better one, by the norm, of the two best matches: least squares may miss a spike."""
+    best = matched.value[jnp.argsort(matched.cost)[:2]]
+    norms = [error_norm(structure, parameters, target) for parameters in best]
+    values = jnp.stack([norm.value for norm in norms])
+    peaks = jnp.stack([norm.frequency for norm in norms])
+    winner = jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))
+    return best[winner], values[winner], peaks[winner]
+
+
+def _outcome(final: HinfNorm, target) -> Status:
+    """The norm's own status, unless the zero model would have done as well."""
+    size = largest_gain(target.response)
+    poor = (final.value >= 0.999 * size) & (size > 0.0)
+    status = Status.where(poor, Status.poor_match, final.status)
+    known = jnp.isfinite(final.value) | (final.status == Status.infinite_norm)
+    return Status.where(known, status, Status.nonfinite)
 
 
 @eqx.filter_jit
@@ -301,7 +333,7 @@ def _check_black_box(black_box: StateSpace, structure: AbstractStructure) -> Non
 
 def _grid(omega: ArrayLike | Sequence, highest: float) -> Float[Array, " frequency"]:
     grid = np.atleast_1d(np.asarray(omega, float))
-    if grid.ndim != 1 or not np.all((grid >= 0) & (grid <= highest * (1 + 1e-9))):
+    if grid.ndim != 1 or grid.size == 0 or not np.all((grid >= 0) & (grid <= highest * (1 + 1e-9))):
         raise ValueError(
             f"omega: frequencies from 0 to the Nyquist frequency ({highest:.4g} rad/s) are needed "
             "in a one-dimensional array."

@@ -39,6 +39,7 @@ def test_poles_of_a_known_system_are_found(capsys, tmp_path, tables):
     # its offset, which costs the last point.
     assert min(content["fit"]["train"] + content["fit"]["test"]) > 98.5
     assert content["offsets"]["y"][0][0] == pytest.approx(-2.0, abs=0.05)
+    assert "is for signals with these means taken out" in captured.out
     assert "5" in captured.out and "BFT" in captured.out and "mean" in captured.out
     assert captured.err == ""
     saved = load(model)
@@ -78,7 +79,10 @@ def test_an_unstable_model_is_warned_of_and_can_be_stabilised(capsys, tmp_path):
     assert content["stable"] is False
     assert len(content["warnings"]) == 1
     assert "--stabilise 0.9999" in content["warnings"][0]
+    assert "po-moesp" not in content["warnings"][0]
     assert captured.err == f"lpvid identify: warning: {content['warnings'][0]}\n"
+    content, _ = identified(capsys, tmp_path, [*argv, "--method", "pi-moesp"])
+    assert content["warnings"][0].endswith(", or use --method po-moesp.")
     content, captured = identified(capsys, tmp_path, [*argv, "--stabilise"])
     assert content["stable"] is True
     assert content["poles_moved"] == 1

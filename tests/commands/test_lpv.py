@@ -9,7 +9,8 @@ from lpvid.commands import main
 from lpvid.io import load
 from lpvid.models import LPVStateSpace
 
-from .record_files import frequencies
+from . import record_files
+from .record_files import frequencies, write_table
 
 COLUMNS = ["--input", "u", "--output", "y", "--time", "t", "--order", "4", "--starts", "2"]
 
@@ -42,6 +43,15 @@ def test_the_model_between_the_points_is_found(capsys, tmp_path, tables):
     assert frozen["lpv"][0] > 98.0
     assert sweep["lpv"][0] > 95.0
     assert max(point["relative_error"] for point in content["points"]) < 1e-6
+    assert content["stable_over_range"] is True
+    for point in content["points"]:
+        assert point["stable"] is True
+        assert point["status"] == point["fit_status"] == "Successful."
+    for part in (*content["points"], frozen):
+        assert part["offsets"]["u"][0][0] == pytest.approx(0.3, abs=0.1)
+        assert part["offsets"]["y"][0][0] == pytest.approx(-2.0, abs=0.1)
+    for words in ("with these means taken out", "local BFT, fitted", "over its range: stable"):
+        assert words in captured.out
     found = np.asarray(saved.at(0.25).modes().frequency)[::2] / (2.0 * np.pi)
     np.testing.assert_allclose(found, frequencies(0.25), rtol=1e-3)
 
@@ -64,3 +74,59 @@ def test_extrapolation_is_warned_of(capsys, tables):
     error = capsys.readouterr().err
     assert error.count("it extrapolates there") == 1
     assert "lpvid lpv: warning:" in error
+
+
+def test_an_unstable_local_model_is_named(capsys, tmp_path, tables, monkeypatch):
+    monkeypatch.setattr(record_files, "DAMPINGS", (-0.001, 0.02))
+    grows = write_table(tmp_path / "grows.csv", np.full(800, 0.5), 1)
+    figures = tmp_path / "figures.json"
+    argv = ["lpv", *at(tables | {"0.5": grows}), *COLUMNS, "--keep-offsets", "--degree", "2"]
+    assert main([*argv, "--json", str(figures)]) == 0
+    content = json.loads(figures.read_text())
+    captured = capsys.readouterr()
+    assert [point["stable"] for point in content["points"]] == [True, False, True]
+    assert content["points"][1]["offsets"] is None
+    assert content["points"][1]["status"] != "Successful."
+    said = [text for text in content["warnings"] if text.startswith("K = 0.5: ")]
+    assert "The identified model is unstable" in said[0] and "--stabilise 0.9999" in said[0]
+    assert said[1] == f"K = 0.5: restructured, but: {content['points'][1]['status']}"
+    assert all(f"lpvid lpv: warning: {text}" in captured.err for text in said)
+    assert "NO" in captured.out and "Offsets" not in captured.out
+
+
+def first_order(folder, poles):
+    """Records of y(t+1) = z y(t) + u(t) at each K, as words of the command line."""
+    words = []
+    for seed, (kappa, z) in enumerate(poles.items()):
+        u = np.random.default_rng(seed).standard_normal(300)
+        y = np.zeros(300)
+        for t in range(1, 300):
+            y[t] = z * y[t - 1] + u[t - 1]
+        file = folder / f"{kappa}.csv"
+        np.savetxt(file, np.c_[u, y], delimiter=",", header="u,y", comments="")
+        words += ["--at", str(kappa), str(file)]
+    words += ["--input", "u", "--output", "y", "--dt", "0.01", "--order", "1", "--keep-offsets"]
+    return ["lpv", *words, "--structure", "black-box"]
+
+
+def test_stable_points_joined_by_unstable_models_are_told(capsys, tmp_path):
+    # The parabola through the poles −10, −0.1, −0.1 1/s is above zero between the last two.
+    poles = {kappa: np.exp(0.01 * s) for kappa, s in ((0.0, -10.0), (0.4, -0.1), (0.6, -0.1))}
+    figures = tmp_path / "figures.json"
+    argv = [*first_order(tmp_path, poles), "--degree", "2", "--json", str(figures)]
+    assert main(argv) == 0
+    content = json.loads(figures.read_text())
+    assert all(point["stable"] for point in content["points"])
+    assert content["stable_over_range"] is False
+    assert "UNSTABLE at some K" in capsys.readouterr().out
+    smooth, unstable = content["warnings"]
+    assert "do not form a smooth family" in smooth
+    # Roots of the parabola: 0.5 ± 0.087; of 33 points the first beyond is 0.43125.
+    assert unstable.startswith("K = 0.43125: the LPV model frozen there is unstable")
+
+
+def test_a_pole_without_a_logarithm_ends_the_command(capsys, tmp_path):
+    assert main(first_order(tmp_path, {0.0: 0.5, 1.0: -0.5})) == 2
+    *_, said = capsys.readouterr().err.splitlines()
+    for words in ("at K = 1", "negative real axis", "--order", "smaller sample time"):
+        assert words in said

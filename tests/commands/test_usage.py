@@ -75,6 +75,15 @@ def refused(capsys, argv, *words, code=2):
         (["lpv", "PAIR", "--order", "auto", *IDENTIFY], ["--order", "'auto'"]),
         (["lpv", "PAIR", "--order", "3", *IDENTIFY], ["--order", "3 is odd"]),
         (["lpv", "PAIR", "--order", "4", "--degree", "-1", *IDENTIFY], ["--degree"]),
+        (
+            ["lpv", "PAIR", "--order", "4", "--degree", "2", *IDENTIFY],
+            ["--degree: 2 in 1 scheduling", "needs 3 distinct points --at, 2 given"],
+        ),
+        (
+            ["lpv", "PLANE", "--order", "4", "--degree", "2", *IDENTIFY],
+            ["--degree: 2 in 2 scheduling", "needs 6 distinct points --at, 3 given"],
+        ),
+        (["lpv", "PLANE", "--order", "4", "--degree", "1", *IDENTIFY], ["do not all lie on"]),
         (["lpv", "PAIR", "--order", "4", "--structure", "x", *IDENTIFY], ["--structure"]),
         (
             ["lpv", "PAIR", "--order", "4", "--structure", "two-link-arm", *IDENTIFY],
@@ -114,6 +123,8 @@ def test_wrong_use_is_said_in_one_line(capsys, tables, tmp_path, monkeypatch, ar
     for word in argv:
         if word == "PAIR":
             full += ["--at", "0", file, "--at", "1", other]
+        elif word == "PLANE":
+            full += ["--at", "0,0", file, "--at", "1,1", other, "--at", "2,2", other]
         else:
             full.append(word.replace("FILE", file))
     refused(capsys, full, *words)

@@ -167,3 +167,13 @@ def test_one_dimensional_input_is_one_channel():
     lpv = LPVStateSpace(structure, basis, coefficients, jnp.zeros(1), jnp.full(1, 2.0))
     y = lpv.simulate(u=np.ones(3), kappa=[1.0, 1.0, 1.0], dt=0.1)
     np.testing.assert_allclose(y[:, 0], (1 - np.exp(-0.3 * np.arange(3))) / 3.0, atol=1e-12)
+
+
+def test_stable_points_do_not_hide_an_unstable_model_between_them():
+    structure = FreeStructure(n_states=1, n_inputs=1, n_outputs=1, feedthrough=False)
+    # A(κ) = 0.5 − κ²: stable at the ends only.
+    coefficients = jnp.array([[0.5, 1.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    basis = polynomial_basis([-1.0, 0.0, 1.0], 2)
+    lpv = LPVStateSpace(structure, basis, coefficients, -jnp.ones(1), jnp.ones(1))
+    np.testing.assert_array_equal(lpv.is_stable([[-1.0], [0.0], [1.0]]), [True, False, True])
+    assert lpv.is_stable(1.0).shape == ()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from lpvid._results import is_successful
+from lpvid._results import Status, is_successful
 from lpvid.mechanics import OPERATING_POINTS, reference_two_link_arm, two_link_arm_structure
 from lpvid.models import (
     AbstractStructure,
@@ -312,3 +312,37 @@ def test_impossible_problems_are_refused(lag, options, message):
 def test_impossible_methods_are_refused(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         HinfMatching(**options)
+
+
+# --- what the status says, and families of models
+
+
+def test_a_useless_match_and_an_unstable_black_box_are_not_called_successful():
+    unstable = StateSpace([[0.0, 4.0], [-4.0, 0.04]], [[0.0], [1.0]], [[4.0, 0.0]])
+    best = restructure(unstable, ONE_MODE, starts=8, key=KEY, method=MATCH_ONLY)
+    assert best.status in (Status.poor_match, Status.l_infinity)
+    if best.error_norm >= 100.0:
+        assert best.status == Status.poor_match
+
+
+def test_modes_that_cross_keep_their_places():
+    structure = ModalStructure(2, n_inputs=1, n_outputs=1)
+    kappas = np.linspace(0.0, 1.0, 5)
+
+    def exact(kappa):
+        modes = [
+            [np.log(10 + 6 * kappa), -3.0, 1.0, 0.2],
+            [np.log(14 - 4 * kappa), -2.0, -2.0, 0.5],
+        ]
+        return np.concatenate(modes)
+
+    black_boxes = [structure.matrices(jnp.asarray(exact(kappa))) for kappa in kappas]
+    local = restructure_along(black_boxes, structure, starts=2, key=KEY, method=MATCH_ONLY)
+    for kappa, found in zip(kappas, local, strict=True):
+        np.testing.assert_allclose(found.parameters, exact(kappa), rtol=1e-5, atol=1e-6)
+
+
+def test_the_number_of_a_failing_black_box_is_said():
+    broken = StateSpace(TWO_MODES.A * np.nan, TWO_MODES.B, TWO_MODES.C)
+    with pytest.raises(ValueError, match=r"black_boxes\[1\]: black_box"):
+        restructure_along([TWO_MODES, broken], ONE_MODE, starts=2, key=KEY, method=MATCH_ONLY)
