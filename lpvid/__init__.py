@@ -43,6 +43,7 @@ from lpvid.identify import PastOutputMOESP as PastOutputMOESP
 from lpvid.identify import estimate_initial_state as estimate_initial_state
 from lpvid.identify import identify as identify
 from lpvid.identify import simulation_fit as simulation_fit
+from lpvid.interpolate import balance_along as balance_along
 from lpvid.interpolate import interpolate as interpolate
 from lpvid.interpolate import interpolate_balanced as interpolate_balanced
 from lpvid.interpolate import interpolation_fit as interpolation_fit

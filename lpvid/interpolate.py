@@ -164,7 +164,7 @@ def _response_at(structure: AbstractStructure, parameters: Array, omega: Array):
 def interpolate_balanced(
     models: Sequence[StateSpace], kappas: ArrayLike | Sequence, method: Polynomial | None = None
 ) -> LPVStateSpace:
-    """The naive way: balance each black box, match signs along κ, interpolate entry by entry.
+    """The naive way: `balance_along` κ, then interpolate entry by entry.
 
     For comparison with 001 only. Balanced bases of neighbouring models need not be coherent
     (nearly equal Hankel singular values rotate them), so that the result may be far off between
@@ -183,10 +183,27 @@ def interpolate_balanced(
         >>> interpolate_balanced(models, [1.0, 2.0, 3.0]).at(2.0).A.round(6).tolist()
         [[-2.0]]
     """
+    return interpolate(balance_along(models), kappas, method)
+
+
+def balance_along(models: Sequence[StateSpace]) -> list[StateSpace]:
+    """Balanced realisations of models ordered along κ, each state signed as its neighbour's.
+
+    Args:
+        models: stable, minimal continuous-time models of one size, in any bases.
+
+    Raises:
+        ValueError: for an unstable model, which has no balanced form.
+
+    Example:
+        >>> models = [StateSpace([[-k]], [[k]], [[-1.0]]) for k in (1.0, 2.0)]
+        >>> [model.A.round(6).item() for model in balance_along(models)]
+        [-1.0, -2.0]
+    """
     balanced = [balance(model)[0] for model in models]
     for index in range(1, len(balanced)):
         balanced[index] = _same_signs(balanced[index], balanced[index - 1])
-    return interpolate(balanced, kappas, method)
+    return balanced
 
 
 def interpolation_fit(

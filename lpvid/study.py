@@ -13,7 +13,7 @@ from lpvid._results import Status
 from lpvid.analysis import bft, hinf_norm, vaf
 from lpvid.data import IOData
 from lpvid.identify import PastInputMOESP, identify
-from lpvid.interpolate import interpolate, interpolate_balanced, interpolation_fit
+from lpvid.interpolate import balance_along, interpolate, interpolation_fit
 from lpvid.mechanics import (
     OPERATING_POINTS,
     StudyRecords,
@@ -26,7 +26,6 @@ from lpvid.mechanics import (
 from lpvid.models import (
     AlignedAverage,
     LPVStateSpace,
-    NaiveAverage,
     Polynomial,
     StateSpace,
     average,
@@ -100,7 +99,7 @@ def run_study(
     At each θ2 one noise-free record is simulated and `runs` realisations of white noise at 30 dB
     are added; each gives a PI-MOESP model of order 6. The models of a point are averaged in
     one basis, restructured to (32) by the H∞ norm, and interpolated in κ = cos θ2. The
-    analytic linearisations and the naively averaged balanced models are interpolated the
+    analytic linearisations and the balanced black boxes (signs matched) are interpolated the
     same way, and all three are compared on a record that crosses the whole range of θ2.
 
     Args:
@@ -137,7 +136,7 @@ def run_study(
     clock.lap("identify")
 
     say("Averaging the models of each point in one basis")
-    black_boxes, naive = _averages(models, succeeded, theta2)
+    black_boxes = _averages(models, succeeded, theta2)
     clock.lap("average")
 
     say("Restructuring by the H-infinity norm")
@@ -149,8 +148,9 @@ def run_study(
     say("Interpolating and validating")
     analytic = [arm.linearised(angle) for angle in theta2]
     kappas = jnp.cos(jnp.asarray(theta2, float))
-    local = {"restructured": restructured, "analytic": analytic, "balanced": naive}
-    lpv = {name: _interpolate(name, local[name], kappas, degree) for name in MODEL_NAMES}
+    balanced = balance_along(black_boxes)
+    local = {"restructured": restructured, "analytic": analytic, "balanced": balanced}
+    lpv = {name: _interpolate(local[name], kappas, degree) for name in MODEL_NAMES}
     sweep = records.sweep
     outputs = {
         name: model.simulate(u=sweep.u, kappa=jnp.asarray(sweep.kappa), dt=sweep.dt)
@@ -158,9 +158,7 @@ def run_study(
     }
     fits = {
         name: {
-            d: float(
-                interpolation_fit(_interpolate(name, local[name], kappas, d), local[name], kappas)
-            )
+            d: float(interpolation_fit(_interpolate(local[name], kappas, d), local[name], kappas))
             for d in (1, 2)
             if d < len(theta2)
         }
@@ -279,8 +277,8 @@ def _identify_batch(template: IOData, u, y, keys):
 
 
 def _averages(models: StateSpace, succeeded: np.ndarray, theta2: Sequence[float]):
-    """Per point: the average in an aligned basis, and 001's average of balanced models."""
-    aligned, naive = [], []
+    """Per point: the average of its models in an aligned basis."""
+    aligned = []
     for index, kept in enumerate(succeeded):
         if not kept.any():
             raise ValueError(
@@ -290,13 +288,11 @@ def _averages(models: StateSpace, succeeded: np.ndarray, theta2: Sequence[float]
         chosen = np.flatnonzero(kept)
         members = jax.tree.map(lambda leaf, i=index, c=chosen: leaf[i][c], models)
         aligned.append(average(members, AlignedAverage()))
-        naive.append(average(members, NaiveAverage()))
-    return aligned, naive
+    return aligned
 
 
-def _interpolate(name: str, models, kappas, degree: int) -> LPVStateSpace:
-    rule = interpolate_balanced if name == "balanced" else interpolate
-    return rule(models, kappas, Polynomial(degree=degree))
+def _interpolate(models, kappas, degree: int) -> LPVStateSpace:
+    return interpolate(models, kappas, Polynomial(degree=degree))
 
 
 def _validate_local(models: Sequence[StateSpace], validation: IOData):
