@@ -6,6 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+# A minute, most of it restructuring; the parts it uses have their own quick tests.
+pytestmark = pytest.mark.slow
+
 FILE = Path(__file__).resolve().parents[1] / "benchmarks" / "f16.py"
 
 

@@ -19,6 +19,7 @@ def at(tables):
     return [word for k in ("1.0", "0.0", "0.5") for word in ("--at", k, tables[k])]
 
 
+@pytest.mark.slow
 def test_the_model_between_the_points_is_found(capsys, tmp_path, tables):
     model, figures = tmp_path / "model.json", tmp_path / "figures.json"
     argv = ["lpv", *at(tables), *COLUMNS, "--degree", "1"]
