@@ -16,7 +16,17 @@ from scipy.linalg import block_diag
 from scipy.signal import dlsim
 
 from lpvid.data import IOData
-from lpvid.identify import PastOutputMOESP, identify
+from lpvid.identify import (
+    CVA,
+    N4SID,
+    ORSE,
+    InformationCriterion,
+    LargestGap,
+    NoiseFloor,
+    PastInputMOESP,
+    PastOutputMOESP,
+    identify,
+)
 
 DT, ORDER, BLOCK_ROWS, DECIBEL = 1 / 50, 6, 20, 30.0
 
@@ -134,6 +144,30 @@ def many_fits(n, realisations, repeats):
     return _rows(f"{realisations} realisations, N = {n}", results, models, status, u, clean)
 
 
+def accuracy(n=3_000, seeds=20):
+    """Fit to the clean output over noise and inputs of many seeds: median and least of each."""
+    methods = {
+        f"lpvid {method.__name__}": method(order=ORDER, block_rows=BLOCK_ROWS)
+        for method in (PastOutputMOESP, PastInputMOESP, N4SID, CVA, ORSE)
+    }
+    fits = {name: [] for name in (*methods, "slicot cholesky")}
+    orders = {name: [] for name in ("NoiseFloor", "InformationCriterion", "LargestGap")}
+    rules = (NoiseFloor(), InformationCriterion(), LargestGap())
+    for seed in range(1, seeds + 1):
+        u, clean, noisy = records(n, seed=seed)
+        data = IOData(u=u, y=noisy[0], dt=DT)
+        for name, method in methods.items():
+            model = identify(data, method).model
+            fits[name].append(fit_to_clean((model.A, model.B, model.C, model.D), u, clean))
+        fits["slicot cholesky"].append(fit_to_clean(slicot_matrices(u, noisy[0], "C"), u, clean))
+        for name, rule in zip(orders, rules, strict=True):
+            orders[name].append(identify(data, PastOutputMOESP(rule, BLOCK_ROWS)).order)
+    return [
+        dict(who=name, median=float(np.median(values)), least=min(values))
+        for name, values in fits.items()
+    ], {name: sum(order == ORDER for order in found) for name, found in orders.items()}
+
+
 def _rows(what, results, models, status, u, clean):
     reference = results["slicot cholesky"]["cpu_s"]
     return [
@@ -158,7 +192,7 @@ def run(*, short=3_000, long=30_000, realisations=100, repeats=40):
     ]
 
 
-if __name__ == "__main__":
+def main():
     for row in run():
         print(
             f"{row['what']:28s} {row['who']:16s} first {row['first_s']:7.2f} s  "
@@ -166,3 +200,13 @@ if __name__ == "__main__":
             f"wall {1e3 * row['wall_s']:8.2f} ms  ratio {row['ratio']:6.2f}  "
             f"fit {row['fit_percent']:.3f} %  {row['status']}"
         )
+    seeds = 20
+    rows, orders = accuracy(seeds=seeds)
+    print(f"\nFit to the clean output, N = 3000, {seeds} seeds")
+    for row in rows:
+        print(f"{row['who']:24s} median {row['median']:.3f} %  least {row['least']:.3f} %")
+    print("Order found: " + ", ".join(f"{name} {n}/{seeds}" for name, n in orders.items()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""Matrix functions and equations: Lyapunov, square root, exponential, logarithm.
+"""Matrix functions and equations: Lyapunov, Riccati, square root, exponential, logarithm.
 
 Each takes matrices with any leading batch axes and returns matrices.
 """
@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 _DOUBLINGS = 60
+_RICCATI_DOUBLINGS = 50
 _SQUARE_ROOTS = 4
 _MOST_SQUARINGS = 18
 # Within this size the Taylor polynomial of degree 16 is exact to rounding.
@@ -151,6 +152,70 @@ def continuous_lyapunov(
         Q: constant term, symmetric or not.
     """
     return continuous_sylvester(A, A.mT, Q)
+
+
+def _structured_doubling(A: Array, G: Array, H: Array) -> Array:
+    """X = Aᵀ X (I + G X)⁻¹ A + H for H and G positive semidefinite, by doubling; NaN in failure."""
+    identity = jnp.eye(A.shape[0])
+
+    def unfinished(carry):
+        A, _, _, count = carry
+        size = jnp.linalg.norm(A)
+        return (count < _RICCATI_DOUBLINGS) & (size > 1e-9) & jnp.isfinite(size)
+
+    def double(carry):
+        A, G, H, count = carry
+        # (I + G H)⁻¹ [A, G] by one factorisation; H (I + G H)⁻¹ A is symmetric with the second.
+        solved = jnp.linalg.solve(identity + G @ H, jnp.concatenate([A, G], axis=1))
+        n = A.shape[0]
+        forward, gain = solved[:, :n], solved[:, n:]
+        G_next = G + A @ gain @ A.T
+        H_next = H + A.T @ H @ forward
+        return A @ forward, 0.5 * (G_next + G_next.T), 0.5 * (H_next + H_next.T), count + 1
+
+    A, _, H, _ = lax.while_loop(unfinished, double, (A, G, H, 0))
+    return jnp.where(jnp.linalg.norm(A) <= 1e-9, H, jnp.nan)
+
+
+def _riccati(A: Array, C: Array, Q: Array, R: Array, S: Array) -> Array:
+    gain = jnp.linalg.solve(R, S.T).T
+    fixed = lax.stop_gradient((A - gain @ C, C.T @ jnp.linalg.solve(R, C), Q - gain @ S.T))
+    closed, information, noise = fixed
+    P = lax.stop_gradient(_structured_doubling(closed.T, information, 0.5 * (noise + noise.T)))
+    # One Newton step, which has the derivatives: of the equation at its solution only the explicit
+    # dependence counts, carried through the closed loop.
+    cross = A @ P @ C.T + S
+    K = jnp.linalg.solve(C @ P @ C.T + R, cross.T).T
+    residual = A @ P @ A.T - P + Q - K @ cross.T
+    stable = lax.stop_gradient(A - K @ C)
+    P = P + _stein(stable, stable.T, 0.5 * (residual + residual.T))
+    return 0.5 * (P + P.T)
+
+
+@jax.jit
+def discrete_riccati(
+    A: Float[Array, "*#batch n n"],
+    C: Float[Array, "*#batch m n"],
+    Q: Float[Array, "*#batch n n"],
+    R: Float[Array, "*#batch m m"],
+    S: Float[Array, "*#batch n m"],
+) -> Float[Array, "*batch n n"]:
+    """Solve the filter's Riccati equation by structure-preserving doubling, any device.
+
+    P = A P Aᵀ + Q − (A P Cᵀ + S)(C P Cᵀ + R)⁻¹(A P Cᵀ + S)ᵀ, the stabilising solution, for which
+    A − K C is Schur stable with K = (A P Cᵀ + S)(C P Cᵀ + R)⁻¹ (Chu, Fan, Lin, Wang 2004,
+    "Structure-preserving algorithms for periodic discrete-time algebraic Riccati equations").
+    NaN where there is none, or where it is nearer to the stability boundary than doubling reaches.
+    First derivatives are those of the solution, by one Newton step on it.
+
+    Args:
+        A: state matrix.
+        C: output matrix.
+        Q: covariance of the state noise.
+        R: covariance of the output noise, positive definite.
+        S: covariance between them, with [[Q, S], [Sᵀ, R]] positive semidefinite.
+    """
+    return batched(_riccati, "(n,n),(m,n),(n,n),(m,m),(n,m)->(n,n)")(A, C, Q, R, S)
 
 
 def _size(matrix: Array) -> Array:

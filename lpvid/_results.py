@@ -29,9 +29,30 @@ class Status(eqx.Enumeration):
         "The estimated model is unstable. Ask for stabilisation, lower the order, or use "
         "past outputs as instruments."
     )
+    no_stable_gain = (
+        "The Riccati equation of the innovation gain has no stabilising solution, so the gain is "
+        "zero. Take more samples or more block rows, or stabilise the model."
+    )
     poor_match = (
         "The structured model is no closer to the black box than no model at all. Give more or "
         "better starts, another structure, or a black box that is stable."
+    )
+    at_bound = (
+        "A parameter ended at its bound; its uncertainty is not given, that of the others holds "
+        "for this value. Widen the bound if the data are to decide."
+    )
+    unidentified = (
+        "The records say nothing about some parameters or combinations of them. Fix or tie them, "
+        "or excite what they act on; their intervals are infinite."
+    )
+    overflow = (
+        "The simulation grows without bound from this start. Give a stable start, shorter records, "
+        "Innovation() with a gain that makes the predictor stable, or OutputError(shooting=...)."
+    )
+    indefinite = (
+        "The records alone give an indefinite mass, damping or stiffness matrix; the nearest "
+        "definite one is returned. Check signs, the pairing of inputs with outputs, and the length "
+        "of the records."
     )
     infinite_norm = (
         "The system has a pole on the stability boundary, so its norm is infinite. Remove the "

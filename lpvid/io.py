@@ -23,6 +23,7 @@ from lpvid.models import (
     ModalStructure,
     PolynomialBasis,
     StateSpace,
+    StructuredModel,
 )
 
 _FORMAT = "lpvid"
@@ -42,6 +43,7 @@ _CLASSES: dict[str, type] = {
         DissipativeTwoLinkArm,
         ArmScales,
         PolynomialBasis,
+        StructuredModel,
     )
 }
 _DTYPES = ("bool", "int32", "int64", "float32", "float64", "complex128")
@@ -64,9 +66,9 @@ class ModelFileError(ValueError):
 def save(path: str | os.PathLike[str], obj: Any) -> Path:
     """Write a model, structure or basis to a JSON file, exactly.
 
-    Saved are `StateSpace`, `LPVStateSpace` and the library's structures and bases. Every float
-    comes back bit for bit (a NaN as a NaN). The file is replaced in one step: an interruption
-    leaves the old one.
+    Saved are `StateSpace`, `LPVStateSpace`, `StructuredModel` and the library's structures and
+    bases. Every float comes back bit for bit (a NaN as a NaN). The file is replaced in one step: an
+    interruption leaves the old one.
 
     Args:
         path: where to.

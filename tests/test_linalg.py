@@ -167,3 +167,37 @@ def test_logm_derivatives_match_the_frechet_derivative():
         np.testing.assert_allclose(tangent, E, atol=1e-11)
     _, pullback = jax.vjp(_linalg.logm, jnp.asarray(exponential))
     np.testing.assert_allclose(np.sum(pullback(jnp.asarray(E))[0] * change), np.sum(E * E))
+
+
+@pytest.mark.parametrize("radius", [0.5, 0.99, 1.2])
+def test_riccati_against_scipy(radius):
+    rng = np.random.default_rng(4)
+    A = rng.standard_normal((6, 6))
+    A *= radius / np.abs(np.linalg.eigvals(A)).max()
+    C, root = rng.standard_normal((2, 6)), rng.standard_normal((8, 8))
+    joint = root @ root.T
+    Q, S, R = joint[:6, :6], joint[:6, 6:], joint[6:, 6:]
+    P = np.asarray(_linalg.discrete_riccati(A, C, Q, R, S))
+    truth = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R, s=S)
+    np.testing.assert_allclose(P, truth, rtol=1e-8, atol=1e-9 * np.abs(truth).max())
+    K = np.linalg.solve(C @ P @ C.T + R, (A @ P @ C.T + S).T).T
+    assert np.abs(np.linalg.eigvals(A - K @ C)).max() < 1.0
+
+
+def test_riccati_gradient_batch_and_failure():
+    rng = np.random.default_rng(5)
+    A, C, root = 0.4 * rng.standard_normal((3, 3)), rng.standard_normal((1, 3)), np.eye(3)
+
+    def corner(A):
+        return _linalg.discrete_riccati(A, C, root, np.eye(1), np.zeros((3, 1)))[..., 0, 1]
+
+    step = rng.standard_normal((3, 3))
+    slope = np.sum(jax.grad(corner)(A) * step)
+    difference = (corner(A + 1e-6 * step) - corner(A - 1e-6 * step)) / 2e-6
+    np.testing.assert_allclose(slope, difference, rtol=1e-7)
+    both = corner(np.stack([A, 0.5 * A]))
+    np.testing.assert_allclose(both, [corner(A), corner(0.5 * A)], rtol=1e-12)
+    # An unstable state that the output does not show.
+    hidden, unseen = np.diag([0.5, 0.5, 1.1]), np.array([[1.0, 1.0, 0.0]])
+    P = _linalg.discrete_riccati(hidden, unseen, root, np.eye(1), np.zeros((3, 1)))
+    assert np.all(np.isnan(P))

@@ -3,23 +3,34 @@
 import numpy as np
 
 from lpvid.data import IOData
-from lpvid.identify._factor import Route, hankel_rows
+from lpvid.identify._factor import RANK_TOLERANCE, Layout, Route
 from lpvid.identify._gram import hankel_factor
 from lpvid.identify._methods import AbstractSubspaceMethod
 
 _LARGEST_DEFAULT = 15
+# Output samples for each parameter of a model below which a fit is little more than a guess.
+_SAMPLES_A_PARAMETER = 10
 
 
-def resolve_block_rows(method: AbstractSubspaceMethod, data: IOData) -> int:
-    """Block rows to use: the method's, or a default that the records can carry.
+def make_layout(method: AbstractSubspaceMethod, data: IOData, lengths: tuple[int, ...]) -> Layout:
+    """Rows of the data matrix: the method's, or a default that the records can carry.
+
+    Args:
+        method: its instruments, order and block rows.
+        data: its channels.
+        lengths: samples in each record.
 
     Raises:
         ValueError: too few samples, naming how many are needed; an order that the block rows cannot
             carry.
     """
-    nu, ny, lengths = data.nu, data.ny, data.lengths
-    order = method.order
-    least = 2 if order == "auto" else -(-order // ny) + 1
+    nu, ny = data.nu, data.ny
+    order = method.order if isinstance(method.order, int) else None
+    least = 2 if order is None else -(-order // ny) + 1
+
+    def layout(block_rows: int) -> Layout:
+        return Layout(block_rows, nu, ny, method.past_inputs, method.past_outputs)
+
     if method.block_rows is not None:
         if method.block_rows < least:
             raise ValueError(
@@ -27,32 +38,35 @@ def resolve_block_rows(method: AbstractSubspaceMethod, data: IOData) -> int:
                 f"{(method.block_rows - 1) * ny} states with {ny} outputs, fewer than order="
                 f"{order}: raise block_rows to {least} or more, or lower the order."
             )
-        _require_samples(method.block_rows, nu, ny, lengths)
-        return method.block_rows
-    wanted = _LARGEST_DEFAULT if order == "auto" else max(10, 2 * order)
+        require_samples(layout(method.block_rows), lengths)
+        return layout(method.block_rows)
+    wanted = _LARGEST_DEFAULT if order is None else max(10, 2 * order)
     chosen = max(least, 2)
-    _require_samples(chosen, nu, ny, lengths)
+    require_samples(layout(chosen), lengths)
     # Twice as many columns as rows, so that the projection averages over something.
-    while chosen < wanted and _columns(chosen + 1, lengths) >= 4 * (chosen + 1) * (nu + ny):
+    while chosen < wanted and _is_wide(layout(chosen + 1), lengths):
         chosen += 1
-    return chosen
+    return layout(chosen)
 
 
-def _columns(block_rows: int, lengths: tuple[int, ...]) -> int:
-    if min(lengths) < 2 * block_rows:
-        return 0
-    return sum(n - 2 * block_rows + 1 for n in lengths)
+def _is_wide(layout: Layout, lengths: tuple[int, ...]) -> bool:
+    return layout.columns(lengths) >= 4 * layout.block_rows * (layout.nu + layout.ny)
 
 
-def _require_samples(block_rows: int, nu: int, ny: int, lengths: tuple[int, ...]) -> None:
+def require_samples(layout: Layout, lengths: tuple[int, ...]) -> None:
+    """Look whether the records are long enough.
+
+    Raises:
+        ValueError: naming the record, and how many samples are needed.
+    """
     shortest = min(lengths)
-    if shortest < 2 * block_rows:
+    block_rows, nu, ny = layout[:3]
+    if shortest < layout.n_lags:
         raise ValueError(
             f"Record {lengths.index(shortest)} has {shortest} samples, but block_rows={block_rows} "
-            f"needs at least {2 * block_rows} in every record: drop the record or lower block_rows."
+            f"needs at least {layout.n_lags} in every record: drop the record or lower block_rows."
         )
-    rows = 2 * block_rows * (nu + ny)
-    needed = rows + len(lengths) * (2 * block_rows - 1)
+    needed = layout.n_lags * (nu + ny) + len(lengths) * (layout.n_lags - 1)
     if sum(lengths) < needed:
         raise ValueError(
             f"The data have {sum(lengths)} samples, but block_rows={block_rows} with {nu} inputs, "
@@ -61,60 +75,104 @@ def _require_samples(block_rows: int, nu: int, ny: int, lengths: tuple[int, ...]
         )
 
 
-def check_varying(data: IOData) -> None:
+def few_samples(order: int, nu: int, ny: int, samples: int) -> str | None:
+    """A warning where there are too few samples for the parameters of a model, else `None`."""
+    parameters = order * (nu + ny) + nu * ny
+    needed = -(-_SAMPLES_A_PARAMETER * parameters // ny)
+    if samples >= needed:
+        return None
+    return (
+        f"{samples} samples are few for order={order} with {nu} inputs and {ny} outputs "
+        f"({parameters} parameters): expect a poor model. Take {needed} samples or more, or lower "
+        f"the order."
+    )
+
+
+def check_varying(data: IOData, still: np.ndarray | None = None) -> None:
     """Look for a channel that never moves.
+
+    Args:
+        data: channels, and their samples.
+        still: which channels do not move, inputs then outputs, where it is known.
 
     Raises:
         ValueError: naming the first one found.
     """
-    for values, names, kind in (
-        (data.u, data.input_names, "Input"),
-        (data.y, data.output_names, "Output"),
-    ):
-        array = np.asarray(values)
-        still = np.ptp(array, axis=0) <= 1e-12 * np.abs(array).max(axis=0)
-        for channel in np.flatnonzero(still):
-            remedy = (
-                "excite it, or leave it out with data.select(inputs=...)"
-                if kind == "Input"
-                else "check the sensor, or leave it out with data.select(outputs=...)"
-            )
-            raise ValueError(
-                f"{kind} {names[channel]!r} is constant, so nothing can be learned from it: "
-                f"{remedy}."
-            )
+    if still is None:
+        array = np.concatenate([np.asarray(data.u), np.asarray(data.y)], axis=1)
+        still = np.asarray(np.ptp(array, axis=0) <= 1e-12 * np.abs(array).max(axis=0))
+    names = [*data.input_names, *data.output_names]
+    for channel in np.flatnonzero(still):
+        kind, remedy = (
+            ("Input", "excite it, or leave it out with data.select(inputs=...)")
+            if channel < data.nu
+            else ("Output", "check the sensor, or leave it out with data.select(outputs=...)")
+        )
+        raise ValueError(
+            f"{kind} {names[channel]!r} is constant, so nothing can be learned from it: {remedy}."
+        )
 
 
-def describe_excitation(data: IOData, block_rows: int) -> str:
+def describe_excitation(data: IOData, layout: Layout, constant: bool) -> str:
     """Which input excites too little for these block rows, and what to do."""
-    wanted = 2 * block_rows
-    for channel, name in enumerate(data.input_names):
-        rank = _rank(data.u[:, channel : channel + 1], data.lengths, block_rows, 1)
+    wanted = layout.input_rows // layout.nu
+    names, block_rows = data.input_names, layout.block_rows
+    for channel, name in enumerate(names):
+        rank = int(np.sum(_pivots(data, [channel], layout, constant) > RANK_TOLERANCE["qr"]))
         if rank < wanted:
             return (
                 f"Input {name!r} excites {rank} of the {wanted} directions that block_rows="
-                f"{block_rows} asks for (2 block_rows): use a richer input (PRBS, noise, more "
-                f"sine lines), or block_rows={max(rank // 2, 2)} or fewer."
+                f"{block_rows} asks for ({wanted // block_rows} a row): use a richer input (PRBS, "
+                f"noise, more sine lines), or block_rows={max(rank * block_rows // wanted, 2)} or "
+                f"fewer."
             )
     return (
-        f"The inputs {', '.join(data.input_names)} each move enough but not independently of one "
+        f"The inputs {', '.join(names)} each move enough but not independently of one "
         f"another (rank below {wanted * data.nu}): excite them by independent signals, or leave "
         f"one out with data.select(inputs=...)."
     )
 
 
-def _rank(signal, lengths, block_rows, nu):
-    rows = hankel_rows(block_rows, nu, 0, past_outputs=False)
-    factor = np.asarray(hankel_factor(signal, lengths, rows))
+def weak_excitation(data: IOData, layout: Layout, constant: bool, pivot: float) -> str:
+    """Which input only just excites enough, and what to do."""
+    alone = [
+        float(np.min(_pivots(data, [channel], layout, constant))) for channel in range(data.nu)
+    ]
+    worst = int(np.argmin(alone))
+    advice = "widen its spectrum (PRBS, noise, faster steps), sample more slowly, or lower "
+    start = f"Input {data.input_names[worst]!r} hardly excites"
+    if alone[worst] > 1e3 * pivot:
+        start = f"The inputs {', '.join(data.input_names)} hardly move independently"
+        advice = "excite them by independent signals, or lower "
+    return (
+        f"{start}: the weakest of the directions that block_rows={layout.block_rows} asks for has "
+        f"a share of {pivot:.1e} of the power (reciprocal condition of the inputs). The model is "
+        f"sensitive to noise: {advice}block_rows."
+    )
+
+
+def _pivots(data: IOData, channels: list[int], layout: Layout, constant: bool) -> np.ndarray:
+    """Share of every input row that the rows before it leave, for some of the inputs."""
+    # In the order of the data matrix: a sample between known ones is foretold best.
+    rows = layout._replace(nu=len(channels), ny=0, past_outputs=False).rows()
+    signal = data.u[:, np.array(channels)]
+    if constant:
+        signal = signal - signal.mean(axis=0, keepdims=True)
+    factor = np.asarray(hankel_factor(signal, data.lengths, rows, constant=constant))
     power = np.maximum(np.sum(factor**2, axis=1), np.finfo(float).tiny)
-    return int(np.sum(np.diagonal(factor) ** 2 / power > 1e-20))
+    return np.diagonal(factor) ** 2 / power
 
 
 def largest_order(block_rows: int, ny: int) -> int:
-    """Largest order that `"auto"` considers: half the rows, so that a noise floor is seen."""
+    """Largest order that a rule considers: half the rows, so that a noise floor is seen."""
     return max(min((block_rows - 1) * ny, block_rows * ny // 2), 1)
 
 
 def negligible(route: Route) -> float:
     """Share of the largest singular value below which one is rounding."""
     return 1e-6 if route == "gram" else 1e-11
+
+
+def resolve_block_rows(method: AbstractSubspaceMethod, data: IOData) -> int:
+    """Block rows of `make_layout` for records in memory."""
+    return make_layout(method, data, data.lengths).block_rows

@@ -1,9 +1,10 @@
 """Gram matrix of block-Hankel data, without the Hankel matrix."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 # Samples handled at once: large enough for fast products, small enough for the cache.
 _CHUNK = 8192
@@ -47,8 +48,49 @@ def lagged_products(
     return jnp.sum(shifted, axis=0).transpose(1, 0, 2)
 
 
+class HankelMoments(eqx.Module):
+    """All that the Gram matrix of block-Hankel data needs to know of the records.
+
+    Attributes:
+        lagged: lagged products summed over records, (lag, channel, channel).
+        heads: first samples of every record, one less than there are lags.
+        tails: last samples of every record, as many.
+        total: sum of every channel over all records.
+    """
+
+    lagged: Float[Array, "lag channel channel"]
+    heads: Float[Array, "record edge channel"]
+    tails: Float[Array, "record edge channel"]
+    total: Float[Array, " channel"]
+
+
+def hankel_moments(
+    w: Float[Array, "time channel"], lengths: tuple[int, ...], n_lags: int
+) -> HankelMoments:
+    """Moments of records one after the other, each at least `n_lags` long.
+
+    Args:
+        w: records one after the other, (time, channel).
+        lengths: samples in each record.
+        n_lags: number of delays in the Hankel matrix.
+    """
+    gap = jnp.zeros((n_lags, w.shape[1]))
+    starts = np.cumsum([0, *lengths])
+    # Zeros between the records keep the lagged products of one from reaching into the next.
+    pieces = [w[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    apart = (
+        w if len(lengths) == 1 else jnp.concatenate([x for piece in pieces for x in (piece, gap)])
+    )
+    return HankelMoments(
+        lagged=lagged_products(apart, n_lags),
+        heads=jnp.stack([w[a : a + n_lags - 1] for a in starts[:-1]]),
+        tails=jnp.stack([w[b - n_lags + 1 : b] for b in starts[1:]]),
+        total=jnp.sum(w, axis=0),
+    )
+
+
 def hankel_gram(
-    w: Float[Array, "time channel"], lengths: tuple[int, ...], rows: np.ndarray
+    moments: HankelMoments, rows: np.ndarray, columns: int, *, constant: bool
 ) -> Float[Array, "row row"]:
     r"""Gram matrix $\sum_r H_r H_r^\top$ of the block-Hankel matrices of several records.
 
@@ -61,29 +103,29 @@ def hankel_gram(
     P the samples at the records' two ends. $O(N s c^2 + s^3 c^2)$ operations, memory $O(s^2 c^2)$.
 
     Args:
-        w: records one after the other, (time, channel).
-        lengths: samples in each record, each at least the number of delays.
+        moments: of the records.
         rows: delays and channels, integers (row, 2).
+        columns: of the Hankel matrices together.
+        constant: whether a row of ones is projected out, $G - m m^\top / M$ with m the row sums.
     """
-    channels = w.shape[1]
+    channels = moments.lagged.shape[1]
     delay, channel = rows[:, 0], rows[:, 1]
-    n_lags = int(delay.max()) + 1
-    gap = jnp.zeros((n_lags, channels))
-    starts = np.cumsum([0, *lengths])
-    # Zeros between the records keep the lagged products of one from reaching into the next.
-    pieces = [w[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
-    apart = (
-        w if len(lengths) == 1 else jnp.concatenate([x for piece in pieces for x in (piece, gap)])
-    )
-    lagged = lagged_products(apart, n_lags)
+    n_lags = moments.lagged.shape[0]
     # R_{-τ} = R_τᵀ: one table over negative and positive lags.
-    table = jnp.concatenate([lagged[:0:-1].transpose(0, 2, 1), lagged])
+    table = jnp.concatenate([moments.lagged[:0:-1].transpose(0, 2, 1), moments.lagged])
     shift = delay[None, :] - delay[:, None] + n_lags - 1
     place = (shift * channels + channel[:, None]) * channels + channel[None, :]
-    toeplitz = _take(table, place)
+    gram = _take(table, place)
+    heads, tails = moments.heads, moments.tails
+    if constant:
+        # Row i misses the samples before i and those from i + M on.
+        none = jnp.zeros((1, channels))
+        before = jnp.concatenate([none, jnp.cumsum(jnp.sum(heads, axis=0), axis=0)])
+        last = jnp.sum(tails, axis=0)
+        after = jnp.concatenate([jnp.cumsum(last[::-1], axis=0)[::-1], none])
+        sums = _take(moments.total[None] - before - after, delay * channels + channel)
+        gram = gram - sums[:, None] * sums[None, :] / columns
 
-    heads = jnp.stack([w[a : a + n_lags - 1] for a in starts[:-1]])
-    tails = jnp.stack([w[b - n_lags + 1 : b] for b in starts[1:]])
     k = np.arange(n_lags - 1)
     before = delay[:, None] - 1 - k[None, :]
     after = delay[:, None] + k[None, :]
@@ -95,16 +137,16 @@ def hankel_gram(
         last = np.where(after < n_lags - 1, after + n_lags - 1, 2 * n_lags - 2)
         return _take(ends, np.concatenate([first, last], axis=1) * channels + channel[:, None])
 
-    if len(lengths) <= _EDGES_AT_ONCE:
+    if heads.shape[0] <= _EDGES_AT_ONCE:
         ends = [edges(head, tail) for head, tail in zip(heads, tails, strict=True)]
         corners = jnp.concatenate(ends, axis=1)
-        return toeplitz - corners @ corners.T
+        return gram - corners @ corners.T
 
     def subtract(gram, ends):
         corners = edges(*ends)
         return gram - corners @ corners.T, None
 
-    return jax.lax.scan(subtract, toeplitz, (heads, tails))[0]
+    return jax.lax.scan(subtract, gram, (heads, tails))[0]
 
 
 def _take(values: Array, flat: np.ndarray) -> Array:
@@ -113,7 +155,11 @@ def _take(values: Array, flat: np.ndarray) -> Array:
 
 
 def hankel_factor(
-    w: Float[Array, "time channel"], lengths: tuple[int, ...], rows: np.ndarray
+    w: Float[Array, "time channel"],
+    lengths: tuple[int, ...],
+    rows: np.ndarray,
+    *,
+    constant: bool = False,
 ) -> Float[Array, "row row"]:
     """Lower triangular factor of the block-Hankel matrix, by Householder reflections.
 
@@ -121,30 +167,63 @@ def hankel_factor(
     ill-conditioned. The Hankel matrix is formed a chunk of columns at a time.
 
     Args:
-        w: as for `hankel_gram`.
-        lengths: as for `hankel_gram`.
-        rows: as for `hankel_gram`.
+        w: records one after the other, (time, channel).
+        lengths: samples in each record.
+        rows: delays and channels, integers (row, 2).
+        constant: whether a row of ones is projected out.
     """
-    n_rows = rows.shape[0]
     n_lags = int(rows[:, 0].max()) + 1
-    factor = jnp.zeros((n_rows, n_rows))
-    # Chunks a few times wider than tall: the triangle on top of each is then little extra work.
-    chunk = max(4 * n_rows, 1024)
+    upper = empty_triangle(rows, constant)
     start = 0
     for length in lengths:
-        columns = length - n_lags + 1
-        width = min(chunk, columns)
-        n_chunks = -(-columns // width)
-        record = jnp.pad(w[start : start + length], ((0, n_chunks * width - columns), (0, 0)))
-
-        def update(upper, k, record=record, width=width, columns=columns):
-            first = k * width
-            piece = jax.lax.dynamic_slice_in_dim(record, first, width + n_lags - 1)
-            index = np.arange(width)
-            formed = piece[index[:, None] + rows[None, :, 0], rows[None, :, 1]]
-            formed = jnp.where((first + index < columns)[:, None], formed, 0.0)
-            return jnp.linalg.qr(jnp.concatenate([upper, formed]), mode="r"), None
-
-        factor = jax.lax.scan(update, factor, jnp.arange(n_chunks))[0]
+        record = w[start : start + length]
+        upper = extend_triangle(upper, record, length - n_lags + 1, rows, constant)
         start += length
-    return factor.T
+    return lower_factor(upper, constant)
+
+
+def empty_triangle(rows: np.ndarray, constant: bool) -> Float[Array, "row row"]:
+    """The triangle before any data: a row of ones first where a constant is projected out."""
+    n_rows = rows.shape[0] + constant
+    return jnp.zeros((n_rows, n_rows))
+
+
+def extend_triangle(
+    upper: Float[Array, "row row"],
+    w: Float[Array, "time channel"],
+    columns: Int[Array, ""] | int,
+    rows: np.ndarray,
+    constant: bool,
+) -> Float[Array, "row row"]:
+    """The upper triangle with the Hankel columns of one more stretch of samples.
+
+    Args:
+        upper: the triangle so far.
+        w: the samples.
+        columns: how many of the Hankel columns count, from the first.
+        rows: delays and channels, integers (row, 2).
+        constant: whether a row of ones leads.
+    """
+    n_lags = int(rows[:, 0].max()) + 1
+    most = w.shape[0] - n_lags + 1
+    # Chunks a few times wider than tall: the triangle on top of each is then little extra work.
+    width = min(max(4 * rows.shape[0], 1024), most)
+    n_chunks = -(-most // width)
+    record = jnp.pad(w, ((0, n_chunks * width - most), (0, 0)))
+    index = np.arange(width)
+
+    def update(upper, k):
+        first = k * width
+        piece = jax.lax.dynamic_slice_in_dim(record, first, width + n_lags - 1)
+        formed = piece[index[:, None] + rows[None, :, 0], rows[None, :, 1]]
+        if constant:
+            formed = jnp.concatenate([jnp.ones((width, 1)), formed], axis=1)
+        formed = jnp.where((first + index < columns)[:, None], formed, 0.0)
+        return jnp.linalg.qr(jnp.concatenate([upper, formed]), mode="r"), None
+
+    return jax.lax.scan(update, upper, jnp.arange(n_chunks))[0]
+
+
+def lower_factor(upper: Float[Array, "row row"], constant: bool) -> Float[Array, "kept kept"]:
+    """The factor of what is left beside the constant."""
+    return upper[constant:, constant:].T

@@ -2,80 +2,64 @@
 
 import functools
 import math
+import sys
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, overload
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
 
 from lpvid._results import Status
 from lpvid.data import IOData
 from lpvid.identify._checks import (
     check_varying,
     describe_excitation,
+    few_samples,
     largest_order,
+    make_layout,
     negligible,
-    resolve_block_rows,
+    weak_excitation,
 )
-from lpvid.identify._factor import ILL_CONDITIONED, Route, data_factor
-from lpvid.identify._linear_fit import solve
-from lpvid.identify._methods import AbstractSubspaceMethod, PastOutputMOESP
-from lpvid.identify._order import choose_order
-from lpvid.identify._realise import left_range, move_inside, realise, spectral_radius
-from lpvid.identify._simulation_error import record_equations
+from lpvid.identify._chunks import ChunkedSource, Chunks
+from lpvid.identify._engine import STABILITY_MARGIN, complete_records, range_of_records
+from lpvid.identify._factor import ILL_CONDITIONED, Layout, Route
+from lpvid.identify._fit import Fit, Moments
+from lpvid.identify._methods import AbstractSubspaceMethod, PastOutputMOESP, projection_only
+from lpvid.identify._order import Evidence
+from lpvid.identify.gray_box import (
+    AbstractContinuousTimeMethod,
+    ContinuousTimeFit,
+    identify_continuous,
+)
 from lpvid.models import StateSpace
 
 # Growth of an unstable model over one window that B and D are estimated from.
 _LARGEST_GROWTH = 1e3
-# The radius is known to about 1e-9; an integrator is not called unstable for that.
-_STABILITY_MARGIN = 1e-8
+# Share of an input row that the other inputs leave, in squares, below which excitation is weak.
+_WEAK_EXCITATION = 1e-14
 
 
-class Fit(eqx.Module):
-    """Result of `identify`.
-
-    Attributes:
-        model: the discrete-time model, its `dt` that of the data.
-        x0: initial state of every record, (record, nx).
-        singular_values: of the projected data, largest first, (block_rows ny,), for channels of
-            unit RMS and independent of the number of samples.
-        order: number of states.
-        status: how it ended.
-        stats: arrays by name: `spectral_radius` of A as returned, `eigenvalues_moved` by
-            stabilisation, `excitation_rank` (full is 2 block_rows nu), `smallest_pivot` (share of a
-            data row, in squares, that the others do not explain: the reciprocal condition),
-            `reflections` (whether the Gram matrix gave way to Householder reflections),
-            `residual_std` of each output's simulation error, (ny,), `window` (samples after which
-            the state was freed anew because the model is unstable; 0: never).
-
-    Example:
-        >>> import numpy as np
-        >>> from lpvid.data import IOData
-        >>> from lpvid.identify import PastOutputMOESP, identify
-        >>> u = np.random.default_rng(0).standard_normal(500)
-        >>> y = np.convolve(u, 0.8 ** np.arange(50))[:500]
-        >>> fit = identify(IOData(u=u, y=y, dt=0.1), PastOutputMOESP(order=1, block_rows=5))
-        >>> fit.order, fit.x0.shape, round(fit.stats["spectral_radius"].item(), 3)
-        (1, (1, 1), 0.8)
-    """
-
-    model: StateSpace
-    x0: Float[Array, "record nx"]
-    singular_values: Float[Array, " row"]
-    order: int = eqx.field(static=True)
-    status: Status
-    stats: dict[str, Array]
-
-
+@overload
 def identify(
-    data: IOData, method: AbstractSubspaceMethod | None = None, *, throw: bool = True
-) -> Fit:
-    r"""Identify a discrete-time state-space model from input-output records.
+    data: IOData, method: AbstractContinuousTimeMethod, *, throw: bool = ...
+) -> ContinuousTimeFit: ...
+@overload
+def identify(
+    data: IOData | Chunks, method: AbstractSubspaceMethod | None = ..., *, throw: bool = ...
+) -> Fit: ...
+def identify(
+    data: IOData | Chunks,
+    method: AbstractSubspaceMethod | AbstractContinuousTimeMethod | None = None,
+    *,
+    throw: bool = True,
+) -> Fit | ContinuousTimeFit:
+    r"""Identify a state-space model from input-output records.
+
+    In discrete time, or in continuous time by a `ContinuousTimeMOESP`, `ContinuousTimeN4SID` or
+    `ContinuousTimeCVA`, for which see `ContinuousTimeFit`; what follows is of discrete time.
 
     A and C come from the range of the extended observability matrix (the method's projection of
     the data), B, D and one initial state for every record from the simulation error
@@ -85,15 +69,15 @@ def identify(
     it.
 
     Runs under `jax.jit`, `jax.vmap` and `jax.lax.map`; there the checks of the data, the fallback
-    to reflections, the windows for unstable models and `order="auto"` are not available, since they
-    look at values, and `status` says what happened. On a CPU `jax.lax.map` over many records is
-    several times faster than `jax.vmap`. Gradients with respect to the data pass through an
+    to reflections, the windows for unstable models and rules for the order are not available, since
+    they look at values, and `status` says what happened. On a CPU `jax.lax.map` over many records
+    is several times faster than `jax.vmap`. Gradients with respect to the data pass through an
     eigenvalue decomposition and hold while the singular values are distinct; with `stabilise` they
     do not exist where an eigenvalue is moved.
 
     Args:
-        data: one or several records.
-        method: `PastOutputMOESP()` by default; `PastInputMOESP(...)`.
+        data: one or several records; or `Chunks` of one record that is larger than memory.
+        method: `PastOutputMOESP()` by default; `N4SID`, `CVA`, `PastInputMOESP`, `ORSE`.
         throw: raise where the data cannot give a model. `False` returns it with its status.
 
     Returns:
@@ -104,7 +88,8 @@ def identify(
             excite too little, an order that the block rows cannot carry.
 
     Warns:
-        UserWarning: the order is above the rank of the data, or the model is unstable.
+        UserWarning: the order is above the rank of the data, the model is unstable, samples are few
+            for the order, or an input hardly excites.
 
     Example:
         >>> import numpy as np
@@ -117,139 +102,167 @@ def identify(
         0.8
     """
     method = PastOutputMOESP() if method is None else method
+    if isinstance(method, AbstractContinuousTimeMethod):
+        if isinstance(data, Chunks):
+            raise ValueError(
+                "data: chunks are for methods in discrete time; give PastOutputMOESP(...) or "
+                "another of them, or a record that fits in memory."
+            )
+        return identify_continuous(data, method, throw=throw)
     if not isinstance(method, AbstractSubspaceMethod):
         raise ValueError(
             f"method={method!r} is no subspace method: give an object such as "
             f"PastOutputMOESP(order=6, block_rows=20)."
         )
-    block_rows = resolve_block_rows(method, data)
-    traced = isinstance(data.u, Tracer) or isinstance(data.y, Tracer)
-    if traced and method.order == "auto":
+    source: _Records | ChunkedSource
+    if isinstance(data, Chunks):
+        head = data.first()
+        # How long the record is comes out only at its end.
+        layout = make_layout(method, head, (sys.maxsize,))
+        source = ChunkedSource(data, head, method)
+    else:
+        head = data
+        layout = make_layout(method, data, data.lengths)
+        source = _Records(data)
+    traced = isinstance(head.u, Tracer) or isinstance(head.y, Tracer)
+    rule = method.rule
+    if traced and rule is not None:
         raise ValueError(
-            'order="auto" looks at singular values and cannot run under jit, vmap or lax.map: '
+            "order: a rule looks at singular values and cannot run under jit, vmap or lax.map: "
             "identify one record without them first, and give its order here."
         )
-    settings = dict(method=method, block_rows=block_rows, lengths=data.lengths)
+    projection = projection_only(method)
     route: Route = "gram"
-    found = _range(data.u, data.y, route=route, **settings)
+    found = source.range(projection, layout, route, rule is not None)
     # Not `<`: a factorisation that broke down says NaN.
     if not traced and not float(found["smallest_pivot"]) > ILL_CONDITIONED:
         if throw:
-            check_varying(data)
+            source.check_varying()
         route = "qr"
-        found = _range(data.u, data.y, route=route, **settings)
-    order = method.order
-    if order == "auto":
-        values = np.asarray(found["singular_values"])
-        order = choose_order(values, largest_order(block_rows, data.ny))
+        found = source.range(projection, layout, route, rule is not None)
+    lengths = source.lengths
+    if rule is None:
+        order = method.order
+        assert isinstance(order, int)
+    else:
+        order = rule.choose(_evidence(found, layout, lengths))
     complete = functools.partial(
-        _complete,
+        source.complete,
         found,
-        data.u,
-        data.y,
         negligible(route),
         order=order,
-        full_rank=2 * block_rows * data.nu,
+        full_rank=layout.input_rows,
         feedthrough=method.feedthrough,
         stabilise=method.stabilise,
+        offset=method.offset,
     )
-    result = complete(windows=data.lengths)
-    if not traced and float(result["spectral_radius"]) > 1.0 + _STABILITY_MARGIN:
-        result = _free_unstable(result, complete, data.lengths, 2 * block_rows)
+    result = complete(windows=lengths)
+    if not traced and float(result["spectral_radius"]) > 1.0 + STABILITY_MARGIN:
+        result = _free_unstable(result, complete, lengths, 2 * layout.block_rows)
     # Read off one number rather than the status: a comparison of those is a computation.
     well = result.pop("successful")
-    fit = _as_fit(result | {name: found[name] for name in _RANGE_STATS}, data)
-    if not traced and not bool(well):
-        _report(fit, data, method, block_rows, negligible(route), throw)
+    fit = _as_fit(found, result, method, layout, lengths, head.dt)
+    if not traced:
+        _warn(fit, source, method, layout, route)
+        if not bool(well):
+            _report(fit, source, method, layout, negligible(route), throw)
     return fit
 
 
-_RANGE_STATS = ("singular_values", "smallest_pivot", "excitation_rank", "reflections")
+class _Records:
+    """The stages of an identification of records in memory."""
+
+    def __init__(self, data: IOData):
+        self.data = data
+        self.lengths = data.lengths
+
+    def range(self, method, layout: Layout, route: Route, correlate: bool) -> dict[str, Any]:
+        """Range of the observability matrix."""
+        return range_of_records(
+            self.data.u,
+            self.data.y,
+            method=method,
+            layout=layout,
+            lengths=self.lengths,
+            route=route,
+            correlate=correlate,
+        )
+
+    def complete(self, found: dict[str, Any], rounding: float, **settings) -> dict[str, Any]:
+        """B, D, offset and x0 for a given order."""
+        needed = {name: found[name] for name in _NEEDED}
+        return complete_records(needed, self.data.u, self.data.y, rounding, **settings)
+
+    def check_varying(self) -> None:
+        """Raise for a constant channel."""
+        check_varying(self.data)
 
 
-def _as_fit(stats: dict[str, Any], data: IOData) -> Fit:
-    A, B, C, D = (stats.pop(name) for name in "ABCD")
-    model = StateSpace(A, B, C, D, data.dt)
+_NEEDED = ("vectors", "singular_values", "scale", "centre", "excitation_rank")
+
+
+def _evidence(found: dict[str, Any], layout: Layout, lengths: tuple[int, ...]) -> Evidence:
+    return Evidence(
+        singular_values=np.asarray(found["singular_values"]),
+        correlations=np.asarray(found["correlations"]),
+        instruments=layout.known_rows - layout.future_inputs,
+        columns=layout.columns(lengths),
+        nu=layout.nu,
+        ny=layout.ny,
+        largest=largest_order(layout.block_rows, layout.ny),
+    )
+
+
+_STATS = (
+    "spectral_radius",
+    "eigenvalues_moved",
+    "residual_std",
+    "window",
+    "smallest_pivot",
+    "excitation_pivot",
+    "excitation_rank",
+    "reflections",
+)
+
+
+def _as_fit(
+    found: dict[str, Any],
+    result: dict[str, Any],
+    method: AbstractSubspaceMethod,
+    layout: Layout,
+    lengths: tuple[int, ...],
+    dt: float,
+) -> Fit:
+    both = found | result
+    model = jax.tree.unflatten(_structure(dt), [result[name] for name in "ABCD"])
+    shared = model.nx * layout.nu + layout.ny * (layout.nu * method.feedthrough + method.offset)
+    records = result["x0"].shape[0]
+    samples, unknowns = sum(lengths), (shared + model.nx * records) / layout.ny
+    moments = Moments(
+        scale=found["scale"],
+        projections=found["projections"],
+        normal_matrix=result["normal_matrix"],
+        columns=layout.columns(lengths),
+        dilution=samples / max(samples - unknowns, 1.0),
+        feedthrough=method.feedthrough,
+        offset=method.offset,
+    )
     return Fit(
         model=model,
-        x0=stats.pop("x0"),
-        singular_values=stats.pop("singular_values"),
+        x0=result["x0"],
+        output_offset=result["output_offset"],
+        singular_values=found["singular_values"],
         order=model.nx,
-        status=stats.pop("status"),
-        stats=stats,
+        status=result["status"],
+        stats={name: both[name] for name in _STATS},
+        moments=moments,
     )
 
 
-@functools.partial(jax.jit, static_argnames=("method", "block_rows", "lengths", "route"))
-def _range(u, y, *, method, block_rows, lengths, route):
-    """Left singular vectors and singular values of the projected data."""
-    w = jnp.concatenate([u, y], axis=1)
-    power = jnp.sqrt(jnp.mean(w * w, axis=0))
-    scale = jnp.where(power > 0.0, power, 1.0)
-    factor, conditioning = data_factor(
-        w,
-        scale,
-        lengths,
-        block_rows=block_rows,
-        nu=u.shape[1],
-        past_outputs=method.past_outputs,
-        route=route,
-    )
-    projected, weight = method.project(factor)
-    vectors, values = left_range(projected, squared=route == "gram")
-    if weight is not None:
-        vectors = jnp.linalg.solve(weight, vectors)
-    columns = sum(n - 2 * block_rows + 1 for n in lengths)
-    return dict(
-        vectors=vectors,
-        singular_values=values / math.sqrt(columns),
-        scale=scale,
-        smallest_pivot=conditioning.smallest_pivot,
-        excitation_rank=conditioning.excitation_rank,
-        reflections=jnp.asarray(route == "qr"),
-    )
-
-
-@functools.partial(
-    jax.jit, static_argnames=("order", "full_rank", "feedthrough", "stabilise", "windows")
-)
-def _complete(found, u, y, rounding, *, order, full_rank, feedthrough, stabilise, windows):
-    """A and C of a given order, then B, D and x0 of every window."""
-    nu = u.shape[1]
-    scale = found["scale"]
-    values = found["singular_values"]
-    observability = found["vectors"][:, :order] * jnp.sqrt(values[:order])[None, :]
-    A, C = realise(observability, y.shape[1])
-    moved = jnp.asarray(0)
-    if stabilise is not False:
-        A, moved = move_inside(A, stabilise)
-    linear = solve(
-        record_equations(A, C, u / scale[None, :nu], y / scale[None, nu:], windows),
-        nx=order,
-        feedthrough=feedthrough,
-    )
-    B = linear.B / scale[None, :nu]
-    D = linear.D * scale[nu:, None] / scale[None, :nu]
-    C = C * scale[nu:, None]
-    radius = spectral_radius(A)
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in (A, B, C, D, linear.x0)]))
-    poor = (values[order - 1] <= rounding * values[0]) | (found["excitation_rank"] < full_rank)
-    status = Status.where(radius > 1.0 + _STABILITY_MARGIN, Status.unstable, Status.successful)
-    status = Status.where(poor, Status.ill_conditioned, status)
-    status = Status.where(finite, status, Status.nonfinite)
-    return dict(
-        A=A,
-        B=B,
-        C=C,
-        D=D,
-        x0=linear.x0,
-        status=status,
-        successful=status == Status.successful,
-        spectral_radius=radius,
-        eigenvalues_moved=moved,
-        residual_std=jnp.sqrt(linear.residual / sum(windows)) * scale[nu:],
-        window=jnp.asarray(0),
-    )
+@functools.lru_cache
+def _structure(dt: float):
+    """A model's tree: filling it skips the constructor's checks, a share of a short fit's time."""
+    return jax.tree.structure(StateSpace(np.eye(1), np.eye(1), np.eye(1), np.eye(1), dt))
 
 
 def _free_unstable(
@@ -273,11 +286,30 @@ def _free_unstable(
     return again | dict(x0=again["x0"][np.array(firsts)], window=jnp.asarray(window))
 
 
+def _warn(
+    fit: Fit,
+    source: "_Records | ChunkedSource",
+    method: AbstractSubspaceMethod,
+    layout: Layout,
+    route: Route,
+) -> None:
+    """Warn of too few samples and of inputs that only just excite enough."""
+    message = few_samples(fit.order, layout.nu, layout.ny, sum(source.lengths))
+    if message is not None:
+        warnings.warn(message, stacklevel=3)
+    if route == "qr":
+        pivot = float(fit.stats["excitation_pivot"])
+        full = int(fit.stats["excitation_rank"]) == layout.input_rows
+        if full and pivot < _WEAK_EXCITATION:
+            message = weak_excitation(source.data, layout, method.offset, pivot)
+            warnings.warn(message, stacklevel=3)
+
+
 def _report(
     fit: Fit,
-    data: IOData,
+    source: "_Records | ChunkedSource",
     method: AbstractSubspaceMethod,
-    block_rows: int,
+    layout: Layout,
     rounding: float,
     throw: bool,
 ) -> None:
@@ -286,7 +318,7 @@ def _report(
         remedies = [
             "Ask for stabilise=0.9999",
             f"lower the order ({fit.order})",
-            f"raise block_rows ({block_rows})",
+            f"raise block_rows ({layout.block_rows})",
         ]
         if not method.past_outputs:
             remedies.append("use past outputs as instruments")
@@ -297,9 +329,9 @@ def _report(
             stacklevel=3,
         )
     elif fit.status == Status.ill_conditioned:
-        if int(fit.stats["excitation_rank"]) < 2 * block_rows * data.nu:
+        if int(fit.stats["excitation_rank"]) < layout.input_rows:
             if throw:
-                raise ValueError(describe_excitation(data, block_rows))
+                raise ValueError(describe_excitation(source.data, layout, method.offset))
             return
         values = np.asarray(fit.singular_values)
         rank = int(np.sum(values > rounding * values[0]))
@@ -313,3 +345,16 @@ def _report(
             "The fit is not finite. Look for outliers, extreme channel scales or an order "
             f"({fit.order}) far above the system's; throw=False returns it as it is."
         )
+
+
+def _range(u, y, *, method, block_rows, lengths, route):
+    layout = Layout(block_rows, u.shape[1], y.shape[1], method.past_inputs, method.past_outputs)
+    return range_of_records(
+        u,
+        y,
+        method=projection_only(method),
+        layout=layout,
+        lengths=lengths,
+        route=route,
+        correlate=False,
+    )

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lpvid.data import IOData
+from lpvid.identify._fit import Fit
 from lpvid.identify._linear_fit import solve_positive
 from lpvid.identify._simulation_error import record_equations
 from lpvid.models import LPVStateSpace, StateSpace
@@ -33,7 +34,7 @@ _equations = jax.jit(record_equations, static_argnames="lengths")
 
 
 def estimate_initial_state(
-    model: StateSpace | LPVStateSpace, data: IOData
+    model: StateSpace | LPVStateSpace | Fit, data: IOData
 ) -> Float[Array, "record nx"]:
     r"""Initial state of every record that minimises the model's simulation error.
 
@@ -42,7 +43,8 @@ def estimate_initial_state(
     the record's length. Composes with `jit`, `vmap` and `grad`.
 
     Args:
-        model: discrete-time, with the data's sample time; or an LPV model, for data with `kappa`.
+        model: discrete-time, with the data's sample time; an LPV model, for data with `kappa`; or a
+            `Fit`, whose output offset is then taken into account.
         data: one or several records.
 
     Returns:
@@ -62,6 +64,7 @@ def estimate_initial_state(
         >>> round(estimate_initial_state(model, data).item(), 6)
         3.0
     """
+    model, data = _without_offset(model, data)
     if isinstance(model, LPVStateSpace):
         return jnp.stack([_lpv_start(model, record) for record in data.records])
     _check_match(model, data)
@@ -72,7 +75,7 @@ def estimate_initial_state(
     return _least_squares_start(model.A, model.B, C, model.D / scale[:, None], equations)
 
 
-def simulation_fit(model: StateSpace | LPVStateSpace, data: IOData) -> Float[Array, " ny"]:
+def simulation_fit(model: StateSpace | LPVStateSpace | Fit, data: IOData) -> Float[Array, " ny"]:
     """Best fit (BFT) of each output, with every record's initial state estimated.
 
     100 max(1 - |y - ŷ| / |y - mean y|, 0) over all records together, the mean taken in each. This
@@ -98,6 +101,7 @@ def simulation_fit(model: StateSpace | LPVStateSpace, data: IOData) -> Float[Arr
         >>> simulation_fit(StateSpace([[0.5]], [[1.0]], [[1.0]], dt=0.1), data).round(3).tolist()
         [100.0]
     """
+    model, data = _without_offset(model, data)
     starts = estimate_initial_state(model, data)
     missed = jnp.zeros(data.ny)
     moved = jnp.zeros(data.ny)
@@ -110,6 +114,17 @@ def simulation_fit(model: StateSpace | LPVStateSpace, data: IOData) -> Float[Arr
         missed += jnp.sum((y - simulated) ** 2, axis=0)
         moved += jnp.sum((y - jnp.mean(y, axis=0, keepdims=True)) ** 2, axis=0)
     return 100.0 * jnp.maximum(1.0 - jnp.sqrt(missed / moved), 0.0)
+
+
+def _without_offset(
+    model: StateSpace | LPVStateSpace | Fit, data: IOData
+) -> tuple[StateSpace | LPVStateSpace, IOData]:
+    """The model itself, and the data it is for: a fit's offset taken out of the outputs."""
+    if not isinstance(model, Fit):
+        return model, data
+    if model.output_offset is None:
+        return model.model, data
+    return model.model, data.replace(y=data.y - model.output_offset[None])
 
 
 def _lpv_start(model: LPVStateSpace, record: IOData) -> Float[Array, " nx"]:

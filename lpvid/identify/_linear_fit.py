@@ -17,26 +17,43 @@ class LinearFit(eqx.Module):
         B: input matrix.
         D: feedthrough.
         x0: initial state of every record.
+        offset: constant of each output, zero where none is estimated.
         residual: sum of squares of each output's simulation error.
     """
 
     B: Float[Array, "nx nu"]
     D: Float[Array, "ny nu"]
     x0: Float[Array, "record nx"]
+    offset: Float[Array, " ny"]
     residual: Float[Array, " ny"]
 
 
-def solve(equations: NormalEquations, *, nx: int, feedthrough: bool) -> LinearFit:
+class LinearCovariance(eqx.Module):
+    """Covariance of the linear unknowns.
+
+    Attributes:
+        shared: of the columns of B, the rows of D, the offsets, (unknown, unknown).
+        x0: of every record's initial state.
+    """
+
+    shared: Float[Array, "unknown unknown"]
+    x0: Float[Array, "record nx nx"]
+
+
+def solve(
+    equations: NormalEquations, *, nx: int, feedthrough: bool, offset: bool = False
+) -> LinearFit:
     """Least squares for B and D, one x0 for each record.
 
     Args:
         equations: normal equations of every record.
         nx: number of states.
         feedthrough: whether D is estimated; zero otherwise.
+        offset: whether the last input is a row of ones, whose entries in D are the offsets.
     """
     records, ny, entries = equations.right.shape
-    nu = entries // (nx + 1) - 1
-    place = jnp.asarray(placement(nx, nu, ny, feedthrough))
+    nu = entries // (nx + 1) - 1 - offset
+    place = jnp.asarray(placement(nx, nu, ny, feedthrough, offset))
     matrix = jnp.einsum("kea,rkef,kfb->rab", place, equations.matrix, place)
     right = jnp.einsum("kea,rke->ra", place, equations.right)
     if records == 1:
@@ -45,7 +62,9 @@ def solve(equations: NormalEquations, *, nx: int, feedthrough: bool) -> LinearFi
     else:
         unknowns = _eliminate_starts(matrix, right, nx)
         theta = unknowns[0]
-    D = theta[nu * nx : -nx].reshape(ny, nu) if feedthrough else jnp.zeros((ny, nu))
+    n_d = ny * nu if feedthrough else 0
+    D = theta[nu * nx :][:n_d].reshape(ny, nu) if feedthrough else jnp.zeros((ny, nu))
+    constant = theta[nu * nx + n_d :][:ny] if offset else jnp.zeros(ny)
     of_output = jnp.einsum("kea,ra->rke", place, unknowns)
     explained = jnp.einsum("rkef,rkf->rke", equations.matrix, of_output) - 2.0 * equations.right
     residual = jnp.sum(of_output * explained, axis=(0, 2)) + jnp.sum(equations.power, axis=0)
@@ -53,23 +72,82 @@ def solve(equations: NormalEquations, *, nx: int, feedthrough: bool) -> LinearFi
         B=theta[: nu * nx].reshape(nu, nx).T,
         D=D,
         x0=unknowns[:, -nx:],
+        offset=constant,
         # Rounding may leave a little less than nothing.
         residual=jnp.maximum(residual, 0.0),
     )
 
 
-def placement(nx: int, nu: int, ny: int, feedthrough: bool) -> np.ndarray:
-    """Zeros and ones from the unknowns [B, D, x0] to the entries of each output's equations."""
+def placement(nx: int, nu: int, ny: int, feedthrough: bool, offset: bool = False) -> np.ndarray:
+    """Zeros and ones from the unknowns [B, D, offset, x0] to the entries of each output."""
     n_b, n_d = nu * nx, ny * nu if feedthrough else 0
-    place = np.zeros((ny, nu + 1, nx + 1, n_b + n_d + nx))
-    states = np.arange(nx)
+    shared = n_b + n_d + (ny if offset else 0)
+    place = np.zeros((ny, nu + offset + 1, nx + 1, shared + nx))
+    states, k = np.arange(nx), np.arange(ny)
     for j in range(nu):
         place[:, j, states, j * nx + states] = 1.0
-    place[:, nu, states, n_b + n_d + states] = 1.0
+    place[:, nu + offset, states, shared + states] = 1.0
     if feedthrough:
-        k, j = np.arange(ny)[:, None], np.arange(nu)[None, :]
-        place[k, j, nx, n_b + k * nu + j] = 1.0
-    return place.reshape(ny, (nu + 1) * (nx + 1), -1)
+        j = np.arange(nu)[None, :]
+        place[k[:, None], j, nx, n_b + k[:, None] * nu + j] = 1.0
+    if offset:
+        place[k, nu, nx, n_b + n_d + k] = 1.0
+    return place.reshape(ny, (nu + offset + 1) * (nx + 1), -1)
+
+
+def covariance(
+    matrix: Float[Array, "record ny entry entry"],
+    variance: Float[Array, " ny"],
+    *,
+    nx: int,
+    feedthrough: bool,
+    offset: bool,
+) -> LinearCovariance:
+    """Covariance of the least-squares solution for white noise, independent between outputs.
+
+    Args:
+        matrix: of the normal equations of every record.
+        variance: of each output's noise.
+        nx: number of states.
+        feedthrough: as for `solve`.
+        offset: as for `solve`.
+    """
+    ny, entries = matrix.shape[1:3]
+    place = jnp.asarray(placement(nx, entries // (nx + 1) - 1 - offset, ny, feedthrough, offset))
+    n_shared = place.shape[2] - nx
+
+    def contracted(one, weights):
+        return jnp.einsum("kea,kef,kfb,k->ab", place, one, place, weights)
+
+    def reduce(one):
+        information = contracted(one, jnp.ones(ny))
+        spread = contracted(one, variance)
+        identity = jnp.eye(nx)
+        inverse = solve_positive(information[n_shared:, n_shared:], identity)
+        # What is left of a record's scores for the shared unknowns once its x0 is solved for.
+        coupling = information[n_shared:, :n_shared]
+        left = jnp.concatenate([jnp.eye(n_shared), -coupling.T @ inverse], axis=1)
+        normal = information[:n_shared, :n_shared] - coupling.T @ inverse @ coupling
+        return (
+            normal,
+            left @ spread @ left.T,
+            left @ spread[:, n_shared:],
+            coupling,
+            inverse,
+            spread,
+        )
+
+    normal, spread, cross, coupling, inverse, whole = jax.lax.map(reduce, matrix)
+    bread = solve_positive(jnp.sum(normal, axis=0), jnp.eye(n_shared))
+    shared = bread @ jnp.sum(spread, axis=0) @ bread
+
+    def start(one):
+        cross, coupling, inverse, whole = one
+        mixed = coupling @ bread @ cross
+        middle = whole[n_shared:, n_shared:] - mixed - mixed.T + coupling @ shared @ coupling.T
+        return inverse @ middle @ inverse
+
+    return LinearCovariance(shared, jax.lax.map(start, (cross, coupling, inverse, whole)))
 
 
 def _eliminate_starts(matrix: Array, right: Array, nx: int) -> Array:

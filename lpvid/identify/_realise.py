@@ -52,7 +52,8 @@ def spectral_radius(A: Float[Array, "nx nx"]) -> Float[Array, ""]:
     norm = jnp.linalg.norm(A)
     safe = jnp.where(norm > 0.0, norm, 1.0)
     power, log_norm = jax.lax.fori_loop(0, 30, square, (A / safe, jnp.log(safe)))
-    return jnp.where(jnp.linalg.norm(power) > 0.0, jnp.exp(log_norm), 0.0)
+    radius = jnp.where(jnp.linalg.norm(power) > 0.0, jnp.exp(log_norm), 0.0)
+    return jnp.where(jnp.isfinite(norm), radius, jnp.nan)
 
 
 def move_inside(

@@ -51,6 +51,27 @@ def normal_equations(
     y: Float[Array, "time ny"],
 ) -> NormalEquations:
     """Normal equations of one record. Memory is flat in the record's length."""
+    return continued_equations(A, C, u, y, first_regressors(C, u.shape[1]))[0]
+
+
+def first_regressors(C: Float[Array, "ny nx"], nu: int) -> Float[Array, "lane nx"]:
+    """Regressors at a record's first sample: none of the inputs', C those of x0."""
+    return jnp.concatenate([jnp.zeros((nu * C.shape[0], C.shape[1])), C])
+
+
+def continued_equations(
+    A: Float[Array, "nx nx"],
+    C: Float[Array, "ny nx"],
+    u: Float[Array, "time nu"],
+    y: Float[Array, "time ny"],
+    start: Float[Array, "lane nx"],
+) -> tuple[NormalEquations, Float[Array, "lane nx"]]:
+    """Normal equations of a stretch of a record, from the regressors at its first sample.
+
+    Returns:
+        The equations, and the regressors after the last sample; these hold where the stretch is a
+        whole number of blocks long (`block_size`).
+    """
     (time, nu), (ny, nx) = u.shape, C.shape
     size = min(block_size(nx, nu, ny), time)
     n_blocks = -(-time // size)
@@ -81,7 +102,6 @@ def normal_equations(
         right = jnp.concatenate([left, yb.reshape(count, size * ny)], axis=1)
         return left.T @ right, left[-1], s[:, -1]
 
-    start = jnp.concatenate([jnp.zeros((nu * ny, nx)), C])
     gram, last, states = piece(start, 0, at_once)
     if n_chunks > 1:
 
@@ -93,7 +113,6 @@ def normal_equations(
     if leftover:
         more, last, states = piece(states, n_chunks * at_once * size, leftover)
         gram = gram + more
-    del states
 
     within = _within(impulse, powers[:size])
     matrix, right = _contract(within, gram, nu)
@@ -105,7 +124,8 @@ def normal_equations(
         ringing = jnp.einsum("kjx,txa->tkja", end, powers[:surplus])
         ringing = jnp.pad(ringing, ((0, 0), (0, 0), (0, 0), (0, 1))).reshape(surplus, ny, -1)
         matrix = matrix - jnp.einsum("tka,tkb->kab", ringing, ringing)
-    return NormalEquations(matrix=matrix, right=right, power=jnp.sum(y * y, axis=0))
+    power = jnp.sum(y * y, axis=0)
+    return NormalEquations(matrix=matrix, right=right, power=power), states
 
 
 def record_equations(

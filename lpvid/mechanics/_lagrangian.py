@@ -133,7 +133,7 @@ def integrate(
 
     def sample(state, held):
         def substep(state, _):
-            return _runge_kutta_step(dynamics, state, held, step), None
+            return runge_kutta_step(dynamics, state, held, step), None
 
         # A loop of one step would cost a loop's overhead a hundred thousand times.
         if substeps == 1:
@@ -174,7 +174,8 @@ def linearise(
     return StateSpace(a, b, c, d)
 
 
-def _runge_kutta_step(dynamics: Dynamics, state: Array, held: Array, step: Array) -> Array:
+def runge_kutta_step(dynamics: Dynamics, state: Array, held: Array, step: Array) -> Array:
+    """One step of the classical Runge–Kutta method, the input held."""
     # The four stages as a loop: the dynamics are traced and compiled once instead of four times.
     look_ahead = jnp.array([0.0, 0.5, 0.5, 1.0])
     weights = jnp.array([1.0, 2.0, 2.0, 1.0]) / 6.0

@@ -19,6 +19,7 @@ from lpvid.models._lpv import LPVStateSpace as LPVStateSpace
 from lpvid.models._mechanical_structure import MechanicalStructure as MechanicalStructure
 from lpvid.models._modal_structure import ModalStructure as ModalStructure
 from lpvid.models._realisations import balance as balance
+from lpvid.models._realisations import balancing as balancing
 from lpvid.models._realisations import gramians as gramians
 from lpvid.models._realisations import modal_form as modal_form
 from lpvid.models._scheduling import Polynomial as Polynomial
@@ -28,6 +29,7 @@ from lpvid.models._simulate import simulate as simulate
 from lpvid.models._simulate import simulate_time_varying as simulate_time_varying
 from lpvid.models._state_space import Modes as Modes
 from lpvid.models._state_space import StateSpace as StateSpace
+from lpvid.models._structured_model import StructuredModel as StructuredModel
 from lpvid.models._structures import AbstractStructure as AbstractStructure
 from lpvid.models._structures import FreeStructure as FreeStructure
 from lpvid.models._structures import FunctionStructure as FunctionStructure

@@ -8,12 +8,17 @@ from lpvid.plot._figure import png_bytes as png_bytes
 from lpvid.plot._figure import save_figure as save_figure
 from lpvid.plot._frequency import bode as bode
 from lpvid.plot._frequency import singular_values as singular_values
+from lpvid.plot._horizon import horizon_errors as horizon_errors
+from lpvid.plot._intervals import parameter_intervals as parameter_intervals
+from lpvid.plot._intervals import profile_likelihood as profile_likelihood
 from lpvid.plot._parameters import parameters as parameters
 from lpvid.plot._poles import mode_frequencies as mode_frequencies
 from lpvid.plot._poles import poles as poles
+from lpvid.plot._residual_tests import residual_tests as residual_tests
 from lpvid.plot._residuals import residuals as residuals
 from lpvid.plot._search import fit_over_points as fit_over_points
 from lpvid.plot._search import minima as minima
 from lpvid.plot._search import scree as scree
+from lpvid.plot._stabilisation import stabilisation as stabilisation
 from lpvid.plot._time import compare as compare
 from lpvid.plot._time import records as records

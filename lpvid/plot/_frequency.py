@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from lpvid.models import StateSpace
+from lpvid.plot._bands import draw_bands
 from lpvid.plot._figure import (
     Axes,
     Values,
@@ -17,7 +18,14 @@ from lpvid.plot._figure import (
     legend,
     styled,
 )
-from lpvid.plot._systems import HZ, continuous_poles, response_of, state_spaces
+from lpvid.plot._systems import (
+    HZ,
+    continuous_poles,
+    response_of,
+    response_uncertainty,
+    state_spaces,
+    uncertain,
+)
 
 
 @styled
@@ -28,6 +36,7 @@ def bode(
     *,
     phase: bool = False,
     decibels: bool = True,
+    level: float | None = 0.95,
     input_names: Sequence[str] | None = None,
     output_names: Sequence[str] | None = None,
     axes: Any = None,
@@ -36,12 +45,14 @@ def bode(
 
     Args:
         systems: a `StateSpace`, a result that holds one, or several in a sequence or a mapping from
-            label to system. A batch of models is drawn in one colour.
+            label to system. A batch of models is drawn in one colour. A refined model comes with
+            its confidence bands (one frequency at a time, delta method).
         omega: frequencies in rad/s; by default a decade around the poles. A discrete-time model is
             drawn up to its Nyquist frequency.
         labels: one for each system of a sequence.
         phase: add a row with the phase, unwrapped, in degrees, below each output.
         decibels: magnitude in dB, or on a logarithmic axis.
+        level: probability of the confidence bands; `None` for no bands.
         input_names: one for each input; u1, u2, ... by default.
         output_names: one for each output; y1, y2, ... by default.
         axes: where to draw, as many as returned; new ones by default.
@@ -51,7 +62,7 @@ def bode(
 
     Raises:
         ValueError: systems with different numbers of inputs or outputs, names or axes that do not
-            fit, or no frequency below the Nyquist frequency.
+            fit, a level that is no probability, or no frequency below the Nyquist frequency.
 
     Example:
         >>> from lpvid.models import StateSpace
@@ -65,6 +76,7 @@ def bode(
     inputs = channel_names(input_names, nu, "u", "input_names")
     outputs = channel_names(output_names, ny, "y", "output_names")
     responses = _responses(models, omega)
+    known = uncertain(systems, labels, level)
     rows = 2 if phase else 1
     panels = grid_of_axes(
         rows * ny,
@@ -85,6 +97,9 @@ def bode(
                 if phase:
                     below: Any = panels[rows * k + 1, j]
                     below.plot(grid / HZ, _phase(one), **look)
+        if label in known and level is not None:
+            spread = response_uncertainty(known[label], grid)
+            draw_bands(panels, rows, grid / HZ, spread, level, decibels, colour(index))
     for (k, j), panel in np.ndenumerate(panels):
         panel.set_xscale("log")
         is_phase = phase and k % 2 == 1
@@ -99,7 +114,7 @@ def bode(
             panel.set_title(f"{outputs[k // rows]} from {inputs[j]}", loc="left")
         if k == rows * ny - 1:
             panel.set_xlabel("frequency (Hz)")
-    if len(models) > 1 or labels is not None:
+    if len(models) > 1 or labels is not None or known:
         legend(panels[0, 0])
     return panels
 

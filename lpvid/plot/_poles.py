@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lpvid.models import LPVStateSpace, StateSpace
+from lpvid.plot._bands import draw_regions
 from lpvid.plot._figure import (
     FAINT,
     MARKERS,
@@ -22,14 +23,25 @@ from lpvid.plot._figure import (
     model_of,
     styled,
 )
-from lpvid.plot._systems import HZ, continuous_poles, plane_poles, state_spaces
+from lpvid.plot._systems import (
+    HZ,
+    continuous_poles,
+    plane_poles,
+    pole_uncertainty,
+    state_spaces,
+    uncertain,
+)
 
 _DAMPINGS = (0.05, 0.1, 0.3, 0.7)
 
 
 @styled
 def poles(
-    systems: Any, labels: Sequence[str] | str | None = None, *, axes: Axes | None = None
+    systems: Any,
+    labels: Sequence[str] | str | None = None,
+    *,
+    level: float | None = 0.95,
+    axes: Axes | None = None,
 ) -> Axes:
     """Poles in the complex plane.
 
@@ -38,12 +50,16 @@ def poles(
     Discrete time: the z-plane with the unit circle.
 
     Args:
-        systems: as for `bode`; the poles of a batch of models make a cloud.
+        systems: as for `bode`; the poles of a batch of models make a cloud. Those of a refined
+            model come with confidence regions, an ellipse for a complex pole and an interval for a
+            real one, each pole on its own (delta method).
         labels: as for `bode`.
+        level: probability of the confidence regions; `None` for no regions.
         axes: where to draw; new ones by default.
 
     Raises:
-        ValueError: continuous- and discrete-time models together.
+        ValueError: continuous- and discrete-time models together, or a level that is no
+            probability.
 
     Example:
         >>> from lpvid.models import StateSpace
@@ -61,6 +77,7 @@ def poles(
     panel = grid_of_axes(1, 1, axes, size=(5.2, 4.4))[0, 0]
     dress(panel)
     is_discrete = discrete.pop()
+    known = uncertain(systems, labels, level)
     for index, (label, model) in enumerate(models.items()):
         values = plane_poles(model).ravel()
         values = values if is_discrete else values / HZ
@@ -78,11 +95,14 @@ def poles(
             label=label,
             zorder=3,
         )
+        if label in known and level is not None:
+            spread = pole_uncertainty(known[label])
+            draw_regions(panel, spread, level, 1.0 if is_discrete else HZ, colour(index))
     if is_discrete:
         _unit_circle(panel)
     else:
         _damping_lines(panel)
-    if len(models) > 1 or labels is not None:
+    if len(models) > 1 or labels is not None or known:
         legend(panel)
     return panel
 

@@ -1,5 +1,3 @@
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lpvid.identify import _gram
-from lpvid.identify._factor import data_factor, hankel_rows
+from lpvid.identify._factor import Layout, factor_of_gram, factor_of_triangle
 
 
 def formed(w, lengths, rows):
@@ -22,15 +20,23 @@ def formed(w, lengths, rows):
     return np.concatenate(parts, axis=1)
 
 
-@pytest.mark.parametrize("lengths", [(57,), (40, 25, 33), (14, 20) * 9])
-def test_gram_and_factor_are_those_of_the_formed_matrix(lengths):
-    w = np.random.default_rng(0).standard_normal((sum(lengths), 3))
-    rows = hankel_rows(7, 2, 1, past_outputs=True)
+@pytest.mark.parametrize(
+    "lengths, constant", [((57,), False), ((40, 25, 33), True), ((14, 20) * 9, False)]
+)
+def test_gram_and_factor_are_those_of_the_formed_matrix(lengths, constant):
+    w = np.random.default_rng(0).standard_normal((sum(lengths), 3)) + 3.0
+    layout = Layout(7, 2, 1, True, True)
+    rows = layout.rows()
     matrix = formed(w, lengths, rows)
+    assert matrix.shape == (rows.shape[0], layout.columns(lengths))
+    if constant:
+        matrix = matrix - matrix.mean(axis=1, keepdims=True)
     truth = matrix @ matrix.T
-    np.testing.assert_allclose(_gram.hankel_gram(jnp.asarray(w), lengths, rows), truth, atol=1e-11)
-    factor = np.asarray(_gram.hankel_factor(jnp.asarray(w), lengths, rows))
-    np.testing.assert_allclose(factor @ factor.T, truth, atol=1e-11)
+    moments = _gram.hankel_moments(jnp.asarray(w), lengths, layout.n_lags)
+    gram = _gram.hankel_gram(moments, rows, matrix.shape[1], constant=constant)
+    np.testing.assert_allclose(gram, truth, atol=1e-10)
+    factor = np.asarray(_gram.hankel_factor(jnp.asarray(w), lengths, rows, constant=constant))
+    np.testing.assert_allclose(factor @ factor.T, truth, atol=1e-10)
     assert np.all(np.triu(factor, 1) == 0)
 
 
@@ -53,26 +59,32 @@ def test_chunks_do_not_change_the_products(monkeypatch):
     np.testing.assert_allclose(_gram.lagged_products(jnp.asarray(w), 9), whole, atol=1e-11)
 
 
-def test_both_routes_give_the_same_factor():
-    rng = np.random.default_rng(2)
-    w, scale = rng.standard_normal((300, 3)), np.array([1.0, 2.0, 0.5])
+@pytest.mark.parametrize("past", [(True, True), (False, False)])
+def test_both_routes_give_the_same_factor(past):
+    w = jnp.asarray(np.random.default_rng(2).standard_normal((300, 3)))
+    layout = Layout(4, 1, 2, *past)
+    rows, columns = layout.rows(), layout.columns((300,))
 
-    @functools.partial(jax.jit, static_argnums=0)
-    def factor(route):
-        return data_factor(
-            jnp.asarray(w),
-            jnp.asarray(scale),
-            (300,),
-            block_rows=4,
-            nu=1,
-            past_outputs=True,
-            route=route,
+    @jax.jit
+    def factors(w):
+        moments = _gram.hankel_moments(w, (300,), layout.n_lags)
+        gram = _gram.hankel_gram(moments, rows, columns, constant=False)
+        whole = _gram.hankel_factor(w, (300,), rows)
+        return (
+            factor_of_gram(gram / columns, layout),
+            factor_of_triangle(whole / np.sqrt(columns), layout),
         )
 
-    (one, one_cond), (two, two_cond) = factor("gram"), factor("qr")
+    one, two = factors(w)
     for name in ("outputs_instruments", "outputs", "instruments_inputs"):
-        a, b = np.asarray(getattr(one, name)), np.asarray(getattr(two, name))
+        a, b = np.asarray(getattr(one.factor, name)), np.asarray(getattr(two.factor, name))
         # Signs of the factor's columns are free.
-        np.testing.assert_allclose(a @ a.T, b @ b.T, atol=1e-9)
-    assert int(one_cond.excitation_rank) == int(two_cond.excitation_rank) == 8
-    np.testing.assert_allclose(one_cond.smallest_pivot, two_cond.smallest_pivot, rtol=1e-9)
+        np.testing.assert_allclose(a @ a.T, b @ b.T, atol=1e-12)
+    a, b = np.asarray(one.outputs_now), np.asarray(two.outputs_now)
+    np.testing.assert_allclose(a @ a.T, b @ b.T, atol=1e-12)
+    np.testing.assert_allclose(a, np.asarray(one.factor.outputs)[:, :2], atol=1e-12)
+    assert int(one.conditioning.excitation_rank) == int(two.conditioning.excitation_rank)
+    assert int(one.conditioning.excitation_rank) == layout.input_rows == (8 if past[0] else 4)
+    for name in ("smallest_pivot", "excitation_pivot"):
+        found = getattr(one.conditioning, name), getattr(two.conditioning, name)
+        np.testing.assert_allclose(*found, rtol=1e-9)

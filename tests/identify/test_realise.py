@@ -2,7 +2,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lpvid.identify._order import choose_order
 from lpvid.identify._realise import left_range, move_inside, realise, spectral_radius
 
 from .helpers import sorted_poles, three_modes
@@ -46,6 +45,10 @@ def test_spectral_radius(A):
     np.testing.assert_allclose(radius, np.abs(np.linalg.eigvals(A)).max(), rtol=3e-8)
 
 
+def test_spectral_radius_of_nonsense_is_nonsense():
+    assert np.isnan(spectral_radius(jnp.full((2, 2), jnp.nan)))
+
+
 def test_only_eigenvalues_outside_are_moved_and_only_their_modulus():
     rng = np.random.default_rng(5)
     basis = rng.standard_normal((3, 3))
@@ -59,10 +62,3 @@ def test_only_eigenvalues_outside_are_moved_and_only_their_modulus():
     unmoved, none = move_inside(inside, 0.9999)
     np.testing.assert_array_equal(unmoved, inside)
     assert int(none) == 0
-
-
-def test_order_by_the_largest_gap():
-    values = np.array([5.0, 4.0, 3.0, 0.01, 0.009, 0.008])
-    assert choose_order(values, 4) == 3
-    # Rounding noise has large ratios of its own.
-    assert choose_order(np.array([5.0, 4.0, 1e-14, 1e-17, 1e-22]), 4) == 2

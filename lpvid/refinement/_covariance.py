@@ -1,0 +1,146 @@
+"""Covariance of an estimate, for white noise and for noise of any colour."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from lpvid._solve import Unknowns
+from lpvid.refinement._criterion import Problem, over_records
+from lpvid.refinement._losses import covariance, inverse_factor
+
+# Eigenvalues of the correlation matrix below this share of the largest are rounding.
+_RANK = 1e-12
+# A value takes part in a direction that cannot be told if this share of it is that direction.
+_PART = 1e-2
+
+
+class Uncertainty(eqx.Module):
+    """Covariances of the values.
+
+    Attributes:
+        covariance: for white noise, the inverse of the information matrix.
+        robust_covariance: for noise of any colour (independent of the input).
+        unidentified: values that take part in a direction that leaves the output as it is.
+    """
+
+    covariance: Float[Array, "value value"]
+    robust_covariance: Float[Array, "value value"]
+    unidentified: Bool[Array, " value"]
+
+
+def uncertainty(
+    problem: Problem,
+    at: Unknowns,
+    residual: Float[Array, "record time ny"],
+    held: Bool[Array, " coordinate"],
+    degrees: int,
+) -> Uncertainty:
+    r"""Covariances at a solution.
+
+    P = H⁻¹ with the information H = Σ Jᵀ Λ⁻¹ J, the initial states eliminated; robust P S P with
+    S = Σ_τ k(τ) Σ_t J_tᵀ Λ⁻¹ Γ(τ) Λ⁻¹ J_{t−τ}: the residual's autocovariance Γ under a Bartlett
+    window k of 2 √N lags (Newey and West 1987, the sensitivities taken as known). What the fit took
+    out of the residual's spectrum is put back, so that S = H in expectation for white noise.
+    Directions whose information is rounding are left out. Holds all records' sensitivities.
+
+    Args:
+        problem: in coordinates about the solution.
+        at: the solution.
+        residual: there.
+        held: coordinates at a bound: taken as known.
+        degrees: unknowns estimated.
+    """
+    mask = problem.mask
+    samples, (longest, ny) = jnp.sum(mask, dtype=float), residual.shape[1:]
+    moved = problem.loss.influence(residual, mask, problem.scale)
+    share = samples / jnp.maximum(samples - degrees / ny, 1.0)
+    noise = share * covariance(moved, mask) + jnp.diag(problem.floor)
+    factor = inverse_factor(noise)
+    lags = min(int(2.0 * longest**0.5) + 1, longest - 1)
+    length = 1 << (longest + lags - 1).bit_length()
+    prepared, tangents = problem.tangents(at)
+    count = problem.basis.shape[1]
+    kept = jnp.where(held, 0.0, 1.0)
+
+    def one(each):
+        record, mask, own, x0 = each
+        by_shared, by_own = problem.sensitivity(prepared, tangents, record, mask, own, x0)
+        by_shared = (by_shared * kept[:, None, None]) @ factor.T
+        if not own.shape[0]:
+            return by_shared, by_own
+        by_own = _orthonormal((by_own @ factor.T).reshape(own.shape[0], -1))
+        flat = by_shared.reshape(count, -1)
+        left = flat - (flat @ by_own.T) @ by_own
+        return left.reshape(by_shared.shape), by_own.reshape(own.shape[0], longest, ny)
+
+    shared, own = over_records(one, (problem.records, mask, at.own, problem.x0))
+    information = jnp.einsum("rpta,rqta->pq", shared, shared)
+    inverse, silent = _inverse(information, held)
+    waves = jnp.fft.rfft(shared, length, axis=2)
+    parts = [jnp.fft.rfft((moved @ factor.T)[:, None], length, axis=2)]
+    if own.shape[1]:
+        parts.append(jnp.fft.rfft(own, length, axis=2))
+    raw = sum(jnp.einsum("rpfa,rpfb->fab", part, jnp.conj(part)) for part in parts)
+    through = jnp.einsum("pq,rqfa->rpfa", inverse.astype(complex), waves)
+    raw = raw + jnp.einsum("rpfa,rpfb->fab", through, jnp.conj(waves))
+    spectrum = _smoothed(raw, lags, length, samples)
+    twice = np.full(length // 2 + 1, 2.0 / length)
+    twice[[0, -1]] = 1.0 / length
+    shaped = jnp.einsum("f,fab,rqfb->rqfa", twice.astype(complex), spectrum, waves)
+    meat = jnp.real(jnp.einsum("rpfa,rqfa->pq", jnp.conj(waves), shaped))
+    robust = inverse @ meat @ inverse
+    basis = problem.basis
+    return Uncertainty(
+        covariance=basis @ inverse @ basis.T,
+        robust_covariance=basis @ (0.5 * (robust + robust.T)) @ basis.T,
+        unidentified=silent(basis) > _PART,
+    )
+
+
+def _orthonormal(own: Float[Array, "own sample"]) -> Float[Array, "own sample"]:
+    """Orthonormal rows of the same span (zeros for what moves nothing)."""
+    size = jnp.linalg.norm(own, axis=1, keepdims=True)
+    own = own / jnp.where(size > 0.0, size, 1.0)
+    values, vectors = jnp.linalg.eigh(own @ own.T)
+    told = values > _RANK
+    roots = jnp.where(told, jax.lax.rsqrt(jnp.where(told, values, 1.0)), 0.0)
+    return (vectors * roots[None, :]).T @ own
+
+
+def _smoothed(raw: Array, lags: int, length: int, samples: Array) -> Array:
+    """A spectrum summed over all records, under the window and a sample, (frequency, ny, ny)."""
+    lag = np.arange(length)
+    window = np.maximum(1.0 - np.minimum(lag, length - lag) / (lags + 1.0), 0.0)
+    correlation = jnp.fft.irfft(raw, length, axis=0) * (window[:, None, None] / samples)
+    return jnp.fft.rfft(correlation, axis=0)
+
+
+def _inverse(information: Array, held: Array) -> tuple[Array, Callable[[Array], Array]]:
+    """Inverse on what can be told; and each value's share in the directions that cannot be."""
+    diagonal = jnp.diagonal(information)
+    known = (diagonal > 0.0) & ~held
+    root = jnp.where(known, jnp.sqrt(jnp.where(known, diagonal, 1.0)), 1.0)
+    scale = jnp.where(known, 1.0 / root, 0.0)
+    correlation = information * scale[:, None] * scale[None, :]
+    finite = jnp.all(jnp.isfinite(correlation))
+    # Coordinates that are held (or move nothing) stay out of the way with a one on the diagonal.
+    rest = jnp.diag(jnp.where(known, 0.0, 1.0))
+    correlation = jnp.where(finite, correlation + rest, jnp.eye(scale.shape[0]))
+    values, vectors = jnp.linalg.eigh(correlation)
+    told = values > _RANK * jnp.max(values)
+    weights = jnp.where(told, 1.0 / jnp.where(told, values, 1.0), 0.0)
+    inverse = (vectors * weights[None, :]) @ vectors.T * scale[:, None] * scale[None, :]
+
+    def silent(basis: Array) -> Array:
+        moved = jnp.where(told, 0.0, 1.0)
+        together = jnp.sum(((basis * scale[None, :]) @ vectors) ** 2 * moved[None, :], axis=1)
+        size = jnp.sum((basis * scale[None, :]) ** 2, axis=1)
+        alone = jnp.where((diagonal > 0.0) | held, 0.0, 1.0)
+        by_itself = (basis**2 @ alone) / jnp.maximum(jnp.sum(basis**2, axis=1), 1e-300)
+        return jnp.maximum(together / jnp.where(size > 0.0, size, 1.0), by_itself)
+
+    return jnp.where(finite, inverse, 0.0), silent

@@ -1,0 +1,136 @@
+"""Residuals over all records, and the normal equations of a fit."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from lpvid._solve import NormalEquations, Unknowns
+from lpvid.refinement._losses import AbstractLoss, Mask, Residual
+from lpvid.refinement._parameterisation import AbstractParameterisation, Record
+
+
+class Problem(eqx.Module):
+    """A model, its records and a loss, in coordinates z about a point: values = base + basis z.
+
+    Attributes:
+        parameterisation: the kind of model.
+        loss: what is minimised.
+        records: padded to one length.
+        mask: which samples count.
+        base: values at z = 0.
+        basis: directions of the coordinates.
+        x0: initial states where they are not estimated, (record, nx).
+        free_start: whether they are.
+        floor: each output's residual variance that is told from rounding.
+        scale: each output's scale in this round.
+    """
+
+    parameterisation: AbstractParameterisation
+    loss: AbstractLoss
+    records: Record
+    mask: Mask
+    base: Float[Array, " value"]
+    basis: Float[Array, "value coordinate"]
+    x0: Float[Array, "record nx"]
+    free_start: bool = eqx.field(static=True)
+    floor: Float[Array, " ny"]
+    scale: Float[Array, " ny"]
+
+    def values(self, z: Float[Array, " coordinate"]) -> Float[Array, " value"]:
+        """The model's values at coordinates z."""
+        return self.base + self.basis @ z
+
+    def _start(self, own: Array, x0: Array) -> Array:
+        return own if self.free_start else x0
+
+    def residual(self, unknowns: Unknowns) -> Residual:
+        """y − ŷ of every record, zero where nothing was measured."""
+        return self.residual_at(self.values(unknowns.shared), unknowns.own)
+
+    def residual_at(
+        self, values: Float[Array, " value"], own: Float[Array, "record own"]
+    ) -> Residual:
+        """The residual of a model with these values."""
+        prepared = self.parameterisation.prepare(values)
+
+        def one(each):
+            record, mask, own, x0 = each
+            y = self.parameterisation.respond(prepared, record, self._start(own, x0))
+            return jnp.where(mask[:, None], record.y - y, 0.0)
+
+        return over_records(one, (self.records, self.mask, own, self.x0))
+
+    def cost(self, unknowns: Unknowns) -> tuple[Float[Array, ""], Residual]:
+        """The loss, and the residual."""
+        residual = self.residual(unknowns)
+        return self.loss.cost(residual, self.mask, self.scale, self.floor), residual
+
+    def tangents(self, unknowns: Unknowns) -> tuple[Any, Any]:
+        """What the records share, and its derivatives along every coordinate."""
+
+        def prepare(z):
+            return self.parameterisation.prepare(self.values(z))
+
+        directions = jnp.eye(self.basis.shape[1])
+        return jax.vmap(lambda d: jax.jvp(prepare, (unknowns.shared,), (d,)), out_axes=(None, 0))(
+            directions
+        )
+
+    def sensitivity(
+        self, prepared: Any, tangents: Any, record: Record, mask: Array, own: Array, x0: Array
+    ) -> tuple[Float[Array, "coordinate time ny"], Float[Array, "own time ny"]]:
+        """Derivatives of one record's output by the coordinates, and by its own initial state."""
+
+        def respond(prepared, own):
+            y = self.parameterisation.respond(prepared, record, self._start(own, x0))
+            return jnp.where(mask[:, None], y, 0.0)
+
+        count, size = self.basis.shape[1], own.shape[0]
+        shared = jax.tree.map(
+            lambda leaf: jnp.concatenate([leaf, jnp.zeros((size, *leaf.shape[1:]))]), tangents
+        )
+        starts = jnp.concatenate([jnp.zeros((count, size)), jnp.eye(size)])
+        by_direction = jax.vmap(
+            lambda shared, start: jax.jvp(respond, (prepared, own), (shared, start))[1]
+        )(shared, starts)
+        return by_direction[:count], by_direction[count:]
+
+    def linearise(self, unknowns: Unknowns, residual: Residual) -> NormalEquations:
+        """Cost, gradient and Gauss–Newton matrix."""
+        white = self.loss.whitening(residual, self.mask, self.scale, self.floor)
+        prepared, tangents = self.tangents(unknowns)
+
+        def one(each):
+            record, mask, own, x0, residual, weights = each
+            by_shared, by_own = self.sensitivity(prepared, tangents, record, mask, own, x0)
+            both = jnp.concatenate([by_shared, by_own])
+            roots = jnp.sqrt(weights)
+            both = (both * roots[None]) @ white.factor.T
+            right = (residual * roots) @ white.factor.T
+            both = both.reshape(both.shape[0], -1)
+            return both @ both.T, -both @ right.reshape(-1)
+
+        matrices, gradients = over_records(
+            one,
+            (self.records, self.mask, unknowns.own, self.x0, residual, white.weights),
+        )
+        count = self.basis.shape[1]
+        return NormalEquations(
+            cost=self.loss.cost(residual, self.mask, self.scale, self.floor),
+            gradient=jnp.sum(gradients[:, :count], axis=0),
+            matrix=jnp.sum(matrices[:, :count, :count], axis=0),
+            own_gradient=gradients[:, count:],
+            own_matrix=matrices[:, count:, count:],
+            coupling=matrices[:, :count, count:],
+        )
+
+
+def over_records(function, arguments):
+    """One record after the other: memory for one Jacobian, and no loop for a single record."""
+    if jax.tree.leaves(arguments)[0].shape[0] == 1:
+        single = function(jax.tree.map(lambda leaf: leaf[0], arguments))
+        return jax.tree.map(lambda leaf: leaf[None], single)
+    return jax.lax.map(function, arguments)

@@ -1,0 +1,101 @@
+"""LPV and nonlinear models: any module that simulates, its arrays the parameters."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lpvid.models import LPVStateSpace
+from lpvid.refinement._parameterisation import AbstractParameterisation, Record, Values
+
+
+class ModuleParameterisation(AbstractParameterisation):
+    """A module with `simulate(u=, dt=, x0=)`: its inexact arrays are the values, leaf by leaf.
+
+    Of an `LPVStateSpace` the coefficients alone are.
+
+    Attributes:
+        model: the module, at any values.
+        dt: sample time of the records.
+        states: length of the initial state; 0 where the module names none.
+    """
+
+    model: Any
+    dt: float = eqx.field(static=True)
+    states: int = eqx.field(static=True)
+
+    def _leaves(self) -> list[tuple[str, Array, int]]:
+        """Name, array and place (among all leaves) of what is estimated."""
+        paths = jax.tree_util.tree_leaves_with_path(self.model)
+        found = []
+        for place, (path, leaf) in enumerate(paths):
+            name = jax.tree_util.keystr(path).lstrip(".")
+            wanted = name == "coefficients" or not isinstance(self.model, LPVStateSpace)
+            if eqx.is_inexact_array(leaf) and wanted:
+                found.append((name, leaf, place))
+        return found
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """A leaf's path, with indices for arrays: `mass`, `coefficients[0,2]`."""
+        return tuple(
+            name + (f"[{','.join(map(str, index))}]" if index else "")
+            for name, leaf, _ in self._leaves()
+            for index in np.ndindex(leaf.shape)
+        )
+
+    @property
+    def n_states(self) -> int:
+        """Length of the initial state."""
+        return self.states
+
+    @property
+    def scale(self) -> Values:
+        """Ones: there is no gauge."""
+        return jnp.ones(len(self.names))
+
+    def start(self) -> Values:
+        """The values of the module itself."""
+        return jnp.concatenate([leaf.astype(float).reshape(-1) for _, leaf, _ in self._leaves()])
+
+    def bounds(self) -> tuple[Values, Values]:
+        """None."""
+        infinite = jnp.full((len(self.names),), jnp.inf)
+        return -infinite, infinite
+
+    def gauge(self, values: Values) -> None:
+        """None is known."""
+        del values
+
+    def innovation_gain(self, values: Values) -> None:
+        """None: the output error alone."""
+        del values
+
+    def build(self, values: Values) -> Any:
+        """The module with other values."""
+        replaced: dict[int, Any] = {}
+        offset = 0
+        for _, leaf, place in self._leaves():
+            part = values[offset : offset + leaf.size]
+            replaced[place] = part.reshape(leaf.shape).astype(leaf.dtype)
+            offset += leaf.size
+        kept = enumerate(jax.tree.leaves(self.model))
+        leaves = [replaced.get(place, leaf) for place, leaf in kept]
+        return jax.tree.unflatten(jax.tree.structure(self.model), leaves)
+
+    def prepare(self, values: Values) -> Float[Array, " value"]:
+        """The values: each record builds its module from them."""
+        return values
+
+    def respond(
+        self, prepared: Float[Array, " value"], record: Record, x0: Array
+    ) -> Float[Array, "time ny"]:
+        """Simulation by the module."""
+        options: dict[str, Any] = {"x0": x0} if self.states else {}
+        if isinstance(self.model, LPVStateSpace):
+            options["kappa"] = record.kappa
+        model = self.build(prepared)
+        return model.simulate(u=record.u, dt=self.dt, **options)

@@ -1,0 +1,62 @@
+"""What the output is predicted from: the input alone, or past outputs as well."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+
+class AbstractPredictor(eqx.Module):
+    """How a model predicts the output."""
+
+
+class OutputError(AbstractPredictor):
+    """Simulation from the input alone: all noise is taken as noise of the measurement.
+
+    The estimate is consistent for coloured noise too, as long as it does not come from the input
+    (no feedback).
+
+    With `shooting` the search goes through pieces of the records, each from a state of its own:
+    over so few samples nothing grows out of bounds, and a poor start does not run away. The pieces
+    then become eight times longer, from the last solution, until each is a whole record; the end is
+    the same maximum of the likelihood as without. For poor or unstable starts, and for unstable and
+    integrating plants.
+
+    Attributes:
+        shooting: samples in the first pieces; None for whole records at once.
+
+    Raises:
+        ValueError: `shooting` is below two.
+
+    Example:
+        >>> OutputError(shooting=50).shooting
+        50
+    """
+
+    shooting: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        if self.shooting is not None and self.shooting < 2:
+            raise ValueError(f"shooting: at least 2 samples are needed, got {self.shooting}.")
+
+
+class Innovation(AbstractPredictor):
+    """One-step prediction x̂⁺ = A x̂ + B u + K e, e = y − C x̂ − D u, K estimated too.
+
+    The maximum likelihood estimate where noise enters the plant as well, or the data come from a
+    closed loop. In continuous time K is that of the discretised model.
+
+    Attributes:
+        gain: where K starts, (nx, ny); by default the innovation gain of the fit that is refined,
+            or zero. An unstable model needs one that makes A − K C stable.
+
+    Example:
+        >>> Innovation().gain is None
+        True
+    """
+
+    gain: Float[Array, "nx ny"] | None = None
+
+    def __init__(self, gain: ArrayLike | Sequence | None = None):
+        self.gain = None if gain is None else jnp.asarray(gain, float)

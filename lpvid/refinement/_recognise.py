@@ -1,0 +1,158 @@
+"""Which kind of model was given, and where its values start."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from lpvid.data import IOData
+from lpvid.identify import ContinuousTimeFit, Fit, MechanicalFit, StepResponseFit
+from lpvid.models import FreeStructure, LPVStateSpace, StateSpace, StructuredModel, balancing
+from lpvid.refinement._modules import ModuleParameterisation
+from lpvid.refinement._parameterisation import (
+    AbstractParameterisation,
+    LinearParameterisation,
+    Record,
+    channel_sizes,
+    free_units,
+)
+from lpvid.refinement._predictors import AbstractPredictor, Innovation
+
+
+class Start(NamedTuple):
+    """A kind of model, and its values and initial states at the start."""
+
+    parameterisation: AbstractParameterisation
+    values: Float[Array, " value"]
+    x0: Float[Array, "record nx"] | None
+
+
+def recognise(model: Any, data: IOData, predictor: AbstractPredictor) -> Start:
+    """Read a model.
+
+    Raises:
+        ValueError: it is of no known kind, or does not fit the data.
+    """
+    gain = predictor.gain if isinstance(predictor, Innovation) else None
+    estimates_gain = isinstance(predictor, Innovation)
+    if isinstance(model, Fit):
+        if gain is None and estimates_gain:
+            gain = getattr(model, "innovation_gain", None)
+        model = model.model
+    if isinstance(model, MechanicalFit):
+        model = StructuredModel(model.structure, model.parameters)
+    if isinstance(model, ContinuousTimeFit | StepResponseFit):
+        model = model.model
+    if isinstance(model, StateSpace):
+        return _black_box(model, data, estimates_gain, gain)
+    if isinstance(model, StructuredModel):
+        return _structured(model, data, estimates_gain, gain)
+    if isinstance(model, eqx.Module) and callable(getattr(model, "simulate", None)):
+        return _module(model, data, estimates_gain)
+    raise ValueError(
+        f"model: {type(model).__name__} cannot be refined; give a StateSpace, a Fit, a "
+        "StructuredModel, an LPVStateSpace or an eqx.Module with simulate(u=, dt=, x0=)."
+    )
+
+
+def _check(model: StateSpace, data: IOData) -> None:
+    if model.A.ndim != 2:
+        raise ValueError("model: one model is needed, without batch axes; use jax.lax.map.")
+    if (model.nu, model.ny) != (data.nu, data.ny):
+        raise ValueError(
+            f"model has {model.nu} inputs and {model.ny} outputs, the data {data.nu} and "
+            f"{data.ny}: choose channels with data.select."
+        )
+    if model.is_discrete and not np.isclose(model.dt, data.dt, rtol=1e-9):
+        raise ValueError(
+            f"model has dt={model.dt}, the data dt={data.dt}: convert it with to_continuous() (and "
+            "discretise at the data's), or check the data's sample time."
+        )
+
+
+def _gain(gain: Array | None, nx: int, ny: int) -> Array:
+    if gain is None:
+        return jnp.zeros((nx, ny))
+    if gain.shape != (nx, ny):
+        raise ValueError(f"predictor: its gain has shape {gain.shape}; ({nx}, {ny}) is needed.")
+    return gain
+
+
+def _black_box(model: StateSpace, data: IOData, estimates_gain: bool, gain) -> Start:
+    _check(model, data)
+    nx, ny = model.nx, model.ny
+    known_zero = not isinstance(model.D, Tracer) and not np.any(np.asarray(model.D))
+    A, B, C, K = _balanced(model, data.u, data.y, _gain(gain, nx, ny))
+    blocks = [A, B, C, *(() if known_zero else (model.D,)), *((K,) if estimates_gain else ())]
+    kind = LinearParameterisation(
+        structure=FreeStructure(nx, model.nu, ny, feedthrough=not known_zero),
+        dt=data.dt,
+        discrete=model.is_discrete,
+        black_box=True,
+        gain=estimates_gain,
+        sizes=(nx, model.nu, ny),
+        units=free_units(A, data.u, data.y, feedthrough=not known_zero, gain=estimates_gain),
+    )
+    return Start(kind, jnp.concatenate([block.reshape(-1) for block in blocks]), None)
+
+
+@jax.jit
+def _balanced(model: StateSpace, u: Array, y: Array, gain: Array) -> tuple[Array, ...]:
+    """A, B, C, K balanced for channels of one size, so that all entries matter about equally.
+
+    As they were, where there is no balanced form (unstable, not minimal).
+    """
+    u_size, y_size = channel_sizes(u), channel_sizes(y)
+    scaled = StateSpace(model.A, model.B * u_size[None, :], model.C / y_size[:, None], dt=model.dt)
+    forward, backward, _ = balancing(scaled)
+    given = (model.A, model.B, model.C, gain)
+    moved = (forward @ model.A @ backward, forward @ model.B, model.C @ backward, forward @ gain)
+    size = jnp.linalg.norm(forward) * jnp.linalg.norm(backward)
+    good = jnp.isfinite(size) & (jnp.max(jnp.abs(forward @ backward - jnp.eye(model.nx))) < 1e-6)
+    return tuple(jnp.where(good, new, old) for new, old in zip(moved, given, strict=True))
+
+
+def _structured(model: StructuredModel, data: IOData, estimates_gain: bool, gain) -> Start:
+    frozen = model.state_space
+    _check(frozen, data)
+    values = model.parameters
+    if estimates_gain:
+        values = jnp.concatenate([values, _gain(gain, frozen.nx, frozen.ny).reshape(-1)])
+    kind = LinearParameterisation(
+        structure=model.structure,
+        dt=data.dt,
+        discrete=False,
+        black_box=False,
+        gain=estimates_gain,
+        sizes=(frozen.nx, frozen.nu, frozen.ny),
+        units=jnp.ones_like(values),
+    )
+    return Start(kind, values, None)
+
+
+def _module(model: Any, data: IOData, estimates_gain: bool) -> Start:
+    if estimates_gain:
+        raise ValueError("predictor: Innovation() is for linear models of constant matrices.")
+    if isinstance(model, LPVStateSpace):
+        if data.kappa is None:
+            raise ValueError("data: an LPV model needs the scheduling; give kappa= to IOData.")
+        states = model.structure.matrices(model.parameters(data.kappa[0])).nx
+    else:
+        states = int(getattr(model, "n_states", getattr(model, "nx", 0)))
+    kind = ModuleParameterisation(model, data.dt, states)
+    if not kind.names:
+        raise ValueError("model: it holds no inexact arrays, so there is nothing to estimate.")
+    values = kind.start()
+    kappa = None if data.kappa is None else data.kappa[:2]
+    record = Record(data.u[:2], data.y[:2], kappa)
+    shape = jax.eval_shape(kind.respond, values, record, jnp.zeros(states))
+    if shape.shape != (2, data.ny):
+        raise ValueError(
+            f"model: its simulate gives {shape.shape} for two samples; this data needs "
+            f"(2, {data.ny})."
+        )
+    return Start(kind, values, None)

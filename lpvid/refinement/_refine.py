@@ -1,0 +1,268 @@
+"""Refinement: maximum likelihood from a start, by Levenberg–Marquardt over the records."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from lpvid._results import Status
+from lpvid._solve import Bounds
+from lpvid.data import IOData
+from lpvid.refinement._coordinates import Ties, gauge_size, matching, select
+from lpvid.refinement._losses import AbstractLoss, SquaredLoss
+from lpvid.refinement._parameterisation import (
+    AbstractParameterisation,
+    Record,
+    cut_up,
+    padded_records,
+)
+from lpvid.refinement._predictors import AbstractPredictor, OutputError
+from lpvid.refinement._recognise import Start, recognise
+from lpvid.refinement._refined import Refined
+from lpvid.refinement._search import Outcome, Task, assess, search
+
+# How much longer the pieces of a shooting search become each time.
+_LONGER = 8
+
+
+def refine(
+    model: Any,
+    data: IOData,
+    *,
+    predictor: AbstractPredictor | None = None,
+    loss: AbstractLoss | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    fixed: Sequence[str] = (),
+    tied: Ties = (),
+    initial_state: str | ArrayLike = "free",
+    max_steps: int = 100,
+    throw: bool = True,
+) -> Refined:
+    r"""Fit a model to records by maximum likelihood, starting from a model of the same kind.
+
+    Minimises $\frac N2 \log\det \hat\Lambda$ of the residual y − ŷ (or a robust loss) over all
+    records by Levenberg–Marquardt with forward-mode derivatives of the blocked simulation; each
+    record has an initial state of its own. What comes out reaches the Cramér–Rao bound where the
+    model holds and the noise is Gaussian, with covariances for white and for coloured noise.
+
+    A black box is balanced first, and searched in the local coordinates that no change of the
+    state's basis can imitate (McKelvey et al. 2004). Its D is estimated unless it is exactly zero.
+
+    Runs under `jax.jit`, `jax.vmap` and `jax.lax.map` over the data (and over a model that
+    `identify` found there): `jax.lax.map(lambda y: refine(model, data.replace(y=y)).parameters,
+    ys)`. Checks that look at numbers are not made there. Not for `jax.grad`. Memory is that of one
+    record's Jacobian; records are padded to the longest.
+
+    Args:
+        model: `StateSpace` (discrete at the data's sample time, or continuous: zero-order hold),
+            `Fit`, `StructuredModel`, `LPVStateSpace` (its coefficients, along the data's
+            `kappa`), or any `eqx.Module` with `simulate(u=, dt=, x0=)`, whose inexact arrays are
+            the parameters and whose `n_states` (or `nx`) says how long x0 is; without it, x0 is
+            not passed.
+        data: one or several records.
+        predictor: `OutputError()` by default, or `Innovation()`.
+        loss: `SquaredLoss()` by default, or `HuberLoss()`.
+        bounds: lower and upper bound by parameter name (* and ? are wildcards), in place of the
+            structure's own.
+        fixed: names of parameters that keep the value they start with.
+        tied: names of parameters that share one value: a pattern, or several patterns, a group.
+        initial_state: `"free"` (estimated, one a record), `"zero"`, or known states (nx,) or
+            (record, nx).
+        max_steps: limit on the trial steps.
+        throw: raise where no fit came out. `False` returns it with its status.
+
+    Returns:
+        The model and what is known about it.
+
+    Raises:
+        ValueError: model and data do not fit, a name matches no parameter, bounds are given for a
+            black box's entries, or (with `throw`) the simulation is not finite from this start.
+
+    Warns:
+        UserWarning: the search did not converge, or parameters are at a bound or unidentified.
+
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.data import IOData
+        >>> from lpvid.models import StateSpace
+        >>> from lpvid.refinement import refine
+        >>> u = np.random.default_rng(0).standard_normal(300)
+        >>> truth = StateSpace([[0.8]], [[1.0]], [[1.0]], dt=0.1)
+        >>> data = IOData(u=u, y=truth.simulate(u=u), dt=0.1)
+        >>> start = StateSpace([[0.7]], [[0.9]], [[1.0]], dt=0.1)
+        >>> round(refine(start, data).model.A.item(), 6)
+        0.8
+    """
+    predictor = OutputError() if predictor is None else predictor
+    loss = SquaredLoss() if loss is None else loss
+    if not isinstance(predictor, AbstractPredictor):
+        raise ValueError(f"predictor={predictor!r}: give OutputError() or Innovation().")
+    if not isinstance(loss, AbstractLoss):
+        raise ValueError(f"loss={loss!r}: give SquaredLoss() or HuberLoss().")
+    if max_steps < 1:
+        raise ValueError(f"max_steps: at least 1 is needed, got {max_steps}.")
+    start = recognise(model, data, predictor)
+    task, chosen, own = prepare(start, data, loss, bounds, fixed, tied, initial_state)
+    records = padded_records(data)
+    found, starts = _shoot(task, records, predictor, chosen, own, max_steps)
+    found, starts, solution = search(task, *records, found, starts, jnp.asarray(max_steps))
+    outcome = assess(task, *records, chosen, own, found, starts, solution)
+    refined = as_refined(task, outcome, data)
+    if not isinstance(refined.cost, Tracer):
+        _report(refined, throw)
+    return refined
+
+
+def _shoot(
+    task: Task,
+    records: tuple[Record, Array],
+    predictor: AbstractPredictor,
+    chosen: Array,
+    own: Array,
+    max_steps: int,
+) -> tuple[Array, Array]:
+    """Searches over pieces of the records, longer and longer; the start where none are asked."""
+    first = predictor.shooting if isinstance(predictor, OutputError) else None
+    if first is None:
+        return chosen, own
+    if not task.free_start:
+        raise ValueError("initial_state: shooting frees the state of every piece; use 'free'.")
+    count, longest = records[1].shape
+    length, pieces = first, own
+    while length < longest:
+        cut = cut_up(*records, length)
+        each = cut[1].shape[0] // count
+        # A new piece starts where the old one that covers its beginning did.
+        pieces = pieces.reshape(count, -1, own.shape[1])
+        covering = np.arange(each) * pieces.shape[1] // each
+        pieces = pieces[:, covering].reshape(-1, own.shape[1])
+        states = jnp.zeros((pieces.shape[0], task.x0.shape[1]))
+        piecewise = eqx.tree_at(lambda t: t.x0, task, states)
+        chosen, pieces, _ = search(piecewise, *cut, chosen, pieces, jnp.asarray(max_steps))
+        length *= _LONGER
+    return chosen, pieces.reshape(count, -1, own.shape[1])[:, 0]
+
+
+def prepare(
+    start: Start,
+    data: IOData,
+    loss: AbstractLoss,
+    bounds: Mapping[str, tuple[float, float]] | None,
+    fixed: Sequence[str],
+    tied: Ties,
+    initial_state: str | ArrayLike,
+) -> tuple[Task, Float[Array, " chosen"], Float[Array, "record own"]]:
+    """The task, and where its search starts."""
+    kind = start.parameterisation
+    selection = select(kind.names, start.values, fixed, tied)
+    lower, upper = _bounds(kind, bounds)
+    gauge = kind.gauge(start.values)
+    remaining = 0
+    if gauge is not None:
+        remaining = gauge.shape[1]
+        if fixed or tied:
+            if isinstance(gauge, Tracer):
+                raise ValueError(
+                    "fixed, tied: a black box's entries can be held for a model with known numbers "
+                    "only, not for one that jit, vmap or lax.map carries."
+                )
+            remaining = gauge_size(selection, np.asarray(gauge), np.asarray(kind.scale))
+    membership = selection.matrix > 0.0
+    inner_lower = jnp.max(jnp.where(membership, lower[:, None], -jnp.inf), axis=0)
+    inner_upper = jnp.min(jnp.where(membership, upper[:, None], jnp.inf), axis=0)
+    free, x0 = _initial_state(initial_state, kind, gauge is not None, len(data.lengths))
+    own = start.x0 if start.x0 is not None else jnp.zeros((len(data.lengths), kind.n_states))
+    task = Task(
+        parameterisation=kind,
+        loss=loss,
+        selection=selection,
+        bounds=Bounds(inner_lower, inner_upper),
+        x0=x0,
+        free_start=free,
+        remaining=remaining,
+    )
+    return task, selection.chosen(start.values), own if free else own[:, :0]
+
+
+def _bounds(
+    kind: AbstractParameterisation, given: Mapping[str, tuple[float, float]] | None
+) -> tuple[Array, Array]:
+    lower, upper = kind.bounds()
+    if not given:
+        return lower, upper
+    if isinstance(kind.gauge(jnp.zeros(len(kind.names))), Array):
+        raise ValueError(
+            "bounds: the entries of a black box depend on the basis of its state, so they have no "
+            "bounds; give StructuredModel(FreeStructure(...), ...) to bound them in one basis."
+        )
+    for pattern, ends in given.items():
+        low, high = (float(end) for end in ends)
+        if not low <= high:
+            raise ValueError(f"bounds[{pattern!r}]: {low} lies above {high}.")
+        at = jnp.asarray(matching(kind.names, pattern, "bounds"))
+        lower, upper = lower.at[at].set(low), upper.at[at].set(high)
+    return lower, upper
+
+
+def _initial_state(
+    given: str | ArrayLike, kind: AbstractParameterisation, any_basis: bool, records: int
+) -> tuple[bool, Float[Array, "record nx"]]:
+    zero = jnp.zeros((records, kind.n_states))
+    if isinstance(given, str):
+        if given not in ("free", "zero"):
+            raise ValueError(f"initial_state={given!r}: give 'free', 'zero' or known states.")
+        return given == "free", zero
+    states = jnp.asarray(given, float)
+    if any_basis:
+        raise ValueError(
+            "initial_state: a black box's states have no basis of their own; use 'free' or 'zero'."
+        )
+    if states.shape not in ((kind.n_states,), zero.shape):
+        raise ValueError(
+            f"initial_state: shape {states.shape} given; ({kind.n_states},) or {zero.shape} is "
+            "needed."
+        )
+    states = states[None] if states.ndim == 1 else states
+    return False, jnp.broadcast_to(states, zero.shape)
+
+
+def as_refined(task: Task, outcome: Outcome, data: IOData) -> Refined:
+    """The public record of an outcome."""
+    kind = task.parameterisation
+    pieces = [outcome.residual[i, :length] for i, length in enumerate(data.lengths)]
+    return Refined(
+        model=kind.build(outcome.values),
+        parameters=outcome.values,
+        parameter_names=kind.names,
+        covariance=outcome.covariance,
+        robust_covariance=outcome.robust_covariance,
+        x0=outcome.x0,
+        innovation_gain=kind.innovation_gain(outcome.values),
+        noise_covariance=outcome.noise_covariance,
+        residual=jnp.concatenate(pieces),
+        cost=outcome.cost,
+        initial_cost=outcome.initial_cost,
+        status=outcome.status,
+        stats={
+            "steps": outcome.steps,
+            "degrees_of_freedom": jnp.asarray(outcome.degrees_of_freedom),
+            "unidentified": outcome.unidentified,
+            "at_bound": outcome.at_bound,
+        },
+        task=task,
+    )
+
+
+def _report(refined: Refined, throw: bool) -> None:
+    """Raise or warn, with the parameter's name and the remedy."""
+    if refined.status == Status.successful:
+        return
+    if throw and (refined.status == Status.nonfinite or refined.status == Status.overflow):
+        raise ValueError(f"The fit failed. {refined.advice} throw=False returns it as it is.")
+    if throw:
+        warnings.warn(f"refine: {refined.advice}", stacklevel=3)

@@ -1,0 +1,91 @@
+"""Every fault of the data ends in an error or a warning that says what to do."""
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy.signal import butter, lfilter
+
+from lpvid.data import IOData, join
+from lpvid.identify import PastOutputMOESP, identify
+
+from .helpers import common_problem, respond, three_modes
+
+DT = 1 / 50
+
+
+@pytest.fixture(scope="module")
+def record():
+    u, _, y = common_problem(400)
+    return u, y
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.01, np.nan, np.inf])
+def test_sample_times_must_be_positive_and_finite(record, dt):
+    with pytest.raises(ValueError, match="dt"):
+        IOData(u=record[0], y=record[1], dt=dt)
+
+
+def test_records_of_different_sample_times_are_not_joined(record):
+    one, two = (IOData(u=record[0], y=record[1], dt=dt) for dt in (0.02, 0.01))
+    with pytest.raises(ValueError, match="bring them to one sample time"):
+        join([one, two])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_samples_that_are_not_finite_are_named(record, bad):
+    u, y = record[0], record[1].copy()
+    y[123, 1] = bad
+    with pytest.raises(ValueError, match=r"y2.*123|123.*y2"):
+        IOData(u=u, y=y, dt=DT)
+
+
+def test_fifty_samples(record):
+    data = IOData(u=record[0][:50], y=record[1][:50], dt=DT)
+    with pytest.warns(UserWarning, match="50 samples are few for order=6 .* Take 140 samples"):
+        identify(data, PastOutputMOESP(order=6))
+    with pytest.raises(ValueError, match="50 samples, but block_rows=20 .* at least 199"):
+        identify(data, PastOutputMOESP(order=6, block_rows=20))
+
+
+def test_an_order_too_high_for_the_rows_or_the_data(record):
+    data = IOData(u=record[0], y=record[1], dt=DT)
+    with pytest.raises(ValueError, match="raise block_rows to 31 or more, or lower the order"):
+        identify(data, PastOutputMOESP(order=60, block_rows=20))
+
+
+def test_constant_and_unexciting_inputs_beside_an_offset(record):
+    u, y = record
+    method = PastOutputMOESP(order=6, block_rows=8, offset=True)
+    names = {"u": ("push", "pull")}
+    still = IOData(u=np.column_stack([u[:, 0], 0 * u[:, 0] + 3.3]), y=y, dt=DT, names=names)
+    with pytest.raises(ValueError, match=r"'pull' is constant.*leave it out with data.select"):
+        identify(still, method)
+    sine = np.column_stack([u[:, 0], np.sin(0.3 * np.arange(len(u)))])
+    with pytest.raises(ValueError, match=r"'pull' excites 2 of the 16 .*use a richer input"):
+        identify(IOData(u=sine, y=y, dt=DT, names=names), method)
+
+
+@pytest.mark.parametrize(
+    "spoil, message",
+    [
+        (lambda u: lfilter(*butter(4, 0.005), u), r"Input 'pull' hardly excites.*widen its spec"),
+        (None, "push, pull hardly move independently.*excite them by independent signals"),
+    ],
+)
+def test_inputs_that_only_just_excite(record, spoil, message):
+    """Full rank, but a condition that leaves few digits: a warning, and a model."""
+    u = record[0]
+    second = u[:, 0] + 1e-8 * u[:, 1] if spoil is None else spoil(u[:, 1])
+    u = np.column_stack([u[:, 0], second])
+    y = respond(three_modes(), u)
+    y = y + 0.01 * np.random.default_rng(0).standard_normal(y.shape)
+    data = IOData(u=u, y=y, dt=DT, names={"u": ("push", "pull")})
+    with pytest.warns(UserWarning, match=message):
+        identify(data, PastOutputMOESP(order=6, block_rows=8))
+
+
+def test_good_data_bring_no_warning(record):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        identify(IOData(u=record[0], y=record[1], dt=DT), PastOutputMOESP(order=6, block_rows=8))
