@@ -9,19 +9,25 @@ import numpy as np
 
 from lpvid import __version__
 from lpvid._results import Status
+from lpvid.analysis import pole_covariance
 from lpvid.commands._cache import keep_compiled_code
+from lpvid.commands._errors import UsageError
 from lpvid.commands._messages import Warnings
-from lpvid.commands._output import check_targets, plain, write_json
+from lpvid.commands._output import NORMAL_95, check_targets, plain, write_json
+from lpvid.commands._parser import CONTINUOUS_METHODS
 from lpvid.commands._records import (
+    any_method,
     check_columns,
-    make_method,
     offsets_of,
     read_records,
     without_offsets,
+    without_rest,
 )
+from lpvid.data import IOData
 from lpvid.identify import Fit, identify, simulation_fit
 from lpvid.io import save
-from lpvid.models import StateSpace
+from lpvid.models import StateSpace, c2d
+from lpvid.refinement import Innovation, OutputError, Refined, refine
 from lpvid.report import text_table
 
 
@@ -34,16 +40,27 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
     data = read_records(arguments, arguments.files)
     print(f"{data!r}")
     train, test = data.split(arguments.split)
+    method = any_method(arguments)
+    if arguments.predictor is not None and not arguments.refine:
+        raise UsageError("--predictor says what --refine fits: give both")
     offset, (train, test) = without_offsets(arguments, train, test)
-    fit = identify(train, make_method(arguments))
-    scores = {
-        "train": np.asarray(simulation_fit(fit.model, train)),
-        "test": np.asarray(simulation_fit(fit.model, test)),
-    }
-    stable = bool(fit.model.is_stable())
-    _print(arguments, fit, scores, train.output_names, stable, offset is not None)
+    fit = identify(train, method)
+    rest = fit.output_offset if isinstance(fit, Fit) else None
+    if offset is not None and rest is not None:
+        test, _ = without_rest(test, offset, rest)
+        train, offset = without_rest(train, offset, rest)
+    models = {"identified": fit.model}
+    refined = None
+    if arguments.refine:
+        predictor = Innovation() if arguments.predictor == "innovation" else OutputError()
+        refined = refine(fit, train, predictor=predictor)
+        models["refined"] = refined.model
+    scores = {name: _scores(model, train, test) for name, model in models.items()}
+    model = models["refined" if arguments.refine else "identified"]
+    stable = bool(model.is_stable())
+    _print(arguments, poles_of(model, refined), scores, train, stable, offset is not None)
     if arguments.out is not None:
-        save(arguments.out, fit.model)
+        save(arguments.out, model)
         print(f"Model saved to {arguments.out}")
     if arguments.json is not None:
         content = {
@@ -56,14 +73,16 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
             "samples": {"train": train.lengths, "test": test.lengths},
             "method": arguments.method,
             "order": fit.order,
-            "block_rows": fit.singular_values.shape[0] // data.ny,
+            "block_rows": int(fit.stats.get("block_rows", fit.singular_values.shape[0] // data.ny)),
             "stable": stable,
-            "poles": poles_of(fit.model),
+            "poles": poles_of(model, refined),
             "singular_values": fit.singular_values,
             "offsets": offsets_of(offset),
-            "fit": scores,
+            "fit": scores["refined" if arguments.refine else "identified"],
+            "fit_before_refinement": scores["identified"] if arguments.refine else None,
             "status": Status[fit.status],
-            "poles_moved": int(fit.stats["eigenvalues_moved"]),
+            "refinement": None if refined is None else _refinement(refined),
+            "poles_moved": int(fit.stats.get("eigenvalues_moved", 0)),
             "seconds": time.perf_counter() - started,
             "warnings": warnings.messages,
         }
@@ -71,11 +90,33 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
         print(f"Figures written to {arguments.json}")
 
 
-def poles_of(model: StateSpace) -> list[dict[str, Any]]:
-    """Poles by frequency: in z, natural frequency, damping ratio, and the equivalent in s."""
+def _scores(model: StateSpace, train: IOData, test: IOData) -> dict[str, np.ndarray]:
+    sampled = model if model.is_discrete else c2d(model, train.dt)
+    return {
+        "train": np.asarray(simulation_fit(sampled, train)),
+        "test": np.asarray(simulation_fit(sampled, test)),
+    }
+
+
+def _refinement(refined: Refined) -> dict[str, Any]:
+    return {
+        "status": refined.advice,
+        "cost": refined.cost,
+        "initial_cost": refined.initial_cost,
+        "noise_std": jnp.sqrt(jnp.diagonal(refined.noise_covariance)),
+        "innovation_gain": refined.innovation_gain,
+    }
+
+
+def poles_of(model: StateSpace, refined: Refined | None = None) -> list[dict[str, Any]]:
+    """Poles by frequency, in z or s: natural frequency, damping ratio, equivalent in s.
+
+    Of a refined model with the standard deviations of frequency and damping ratio.
+    """
     modes = model.modes()
-    discrete = np.asarray(jnp.exp(modes.poles * model.dt))
-    return [
+    poles = np.asarray(modes.poles)
+    own = np.exp(poles * model.dt) if model.is_discrete else poles
+    found = [
         {
             "re": float(z.real),
             "im": float(z.imag),
@@ -84,40 +125,59 @@ def poles_of(model: StateSpace) -> list[dict[str, Any]]:
             "continuous": {"re": float(s.real), "im": float(s.imag)},
         }
         for z, s, frequency, damping in zip(
-            discrete,
-            np.asarray(modes.poles),
-            np.asarray(modes.frequency),
-            np.asarray(modes.damping),
-            strict=True,
+            own, poles, np.asarray(modes.frequency), np.asarray(modes.damping), strict=True
         )
     ]
+    if refined is None:
+        return found
+    spread = pole_covariance(refined.model_at, refined.parameters, refined.robust_covariance)
+    for pole in found:
+        nearest = np.argmin(np.abs(np.asarray(spread.poles) - complex(pole["re"], pole["im"])))
+        pole["frequency_std_hz"] = float(spread.frequency_std[nearest]) / (2.0 * np.pi)
+        pole["damping_std"] = float(spread.damping_std[nearest])
+    return found
 
 
 def _print(
     arguments: argparse.Namespace,
-    fit: Fit,
-    scores: dict[str, np.ndarray],
-    outputs: tuple[str, ...],
+    poles: list[dict[str, Any]],
+    scores: dict[str, dict[str, np.ndarray]],
+    data: IOData,
     stable: bool,
     offsets_removed: bool,
 ) -> None:
     if offsets_removed:
         print(
-            "Offsets: each channel's mean over the fitted part was taken out of both parts.\n"
-            "The model is for signals with these means taken out (--json lists them)."
+            "Offsets: taken out of both parts as the fitted part shows them (--json lists them).\n"
+            "The model is for signals without them."
         )
     state = "stable" if stable else "UNSTABLE"
-    print(f"Order {fit.order}, {arguments.method}, {state}.\n")
+    print(f"Order {len(poles)}, {arguments.method}, {state}.\n")
+    domain = "s" if arguments.method in CONTINUOUS_METHODS else "z"
     rows = [
-        (pole["frequency_hz"], pole["damping"], f"{pole['re']:.6f} + {pole['im']:.6f}j")
-        for pole in poles_of(fit.model)
+        (
+            pole["frequency_hz"],
+            *_interval(pole, "frequency_std_hz"),
+            pole["damping"],
+            *_interval(pole, "damping_std"),
+            f"{pole['re']:.6f} + {pole['im']:.6f}j",
+        )
+        for pole in poles
         if pole["im"] >= 0.0
     ]
-    print(text_table(rows, ["frequency (Hz)", "damping", "pole (z)"]) + "\n")
+    sure = ["95 %"] if arguments.refine else []
+    header = ["frequency (Hz)", *sure, "damping", *sure, f"pole ({domain})"]
+    print(text_table(rows, header) + "\n")
     table = [
-        (name, train, test)
-        for name, train, test in zip(
-            outputs, plain(scores["train"]), plain(scores["test"]), strict=True
-        )
+        (name, *(plain(fit[part])[k] for fit in scores.values() for part in ("train", "test")))
+        for k, name in enumerate(data.output_names)
     ]
-    print(text_table(table, ["output", "BFT fitted (%)", "BFT rest (%)"]))
+    parts = ["fitted (%)", "rest (%)"]
+    header = ["output", *(f"BFT {part}" for part in parts)]
+    if arguments.refine:
+        header += [f"refined, {part}" for part in parts]
+    print(text_table(table, header))
+
+
+def _interval(pole: dict[str, Any], name: str) -> tuple[str, ...]:
+    return (f"± {NORMAL_95 * pole[name]:.2g}",) if name in pole else ()

@@ -20,10 +20,11 @@ from lpvid.commands._messages import Warnings, say
 from lpvid.commands._output import check_targets, write_json
 from lpvid.commands._records import (
     check_columns,
-    make_method,
     offsets_of,
     read_records,
+    subspace_method,
     without_offsets,
+    without_rest,
 )
 from lpvid.data import IOData, Offset, join
 from lpvid.identify import Fit, identify, simulation_fit
@@ -249,9 +250,11 @@ def _identify(
 ) -> _Point:
     offset, (data,) = without_offsets(arguments, data)
     try:
-        fit = identify(data, make_method(arguments))
+        fit = identify(data, subspace_method(arguments))
     except ValueError as error:
         raise UsageError(f"at K = {written(kappa)}: {error}") from error
+    if offset is not None and fit.output_offset is not None:
+        data, offset = without_rest(data, offset, fit.output_offset)
     # Of an ill-conditioned fit, `identify` says only that.
     if not bool(fit.model.is_stable()) and not bool(fit.status == Status.unstable):
         warnings.add("the model is not stable; ask for --stabilise, or another --order")

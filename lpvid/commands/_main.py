@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(arguments: argparse.Namespace, warnings: Warnings) -> None:
     # Imported only now: help and faults of usage do not wait for what a command needs.
-    command = importlib.import_module(f"lpvid.commands._{arguments.command}")
+    command = importlib.import_module(f"lpvid.commands._{arguments.command.replace('-', '_')}")
     command.run(arguments, warnings)
 
 

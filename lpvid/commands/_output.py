@@ -12,6 +12,9 @@ import numpy as np
 from lpvid._files import write_atomically
 from lpvid.commands._errors import UsageError
 
+# Half a 95 % interval in standard deviations.
+NORMAL_95 = 1.959963984540054
+
 
 def check_targets(targets: dict[str, str | None], sources: Sequence[str] = ()) -> None:
     """Raise unless every file (option → path) can be written and is none of the sources."""

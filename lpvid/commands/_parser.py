@@ -1,15 +1,18 @@
 """The arguments of every command."""
 
 import argparse
-import math
 import re
 from collections.abc import Sequence
 from typing import NoReturn
 
+from lpvid.commands import _values as values
 from lpvid.commands._errors import UsageError
 
-METHODS = ("po-moesp", "pi-moesp")
+METHODS = ("po-moesp", "pi-moesp", "n4sid", "cva", "orse")
+CONTINUOUS_METHODS = ("continuous-moesp", "continuous-n4sid", "continuous-cva")
+STEP_METHODS = ("deviation", "primal", "dual")
 STRUCTURES = ("modal", "mechanical", "two-link-arm", "black-box")
+PREDICTORS = ("output-error", "innovation")
 MEASURED = ("displacement", "velocity", "acceleration")
 _RADIUS = 0.9999
 _NEGATIVE_NUMBERS = re.compile(r"-[\d.][\d.,eE+-]*")
@@ -41,6 +44,8 @@ def make_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     _add_demo(commands)
     _add_identify(commands)
+    _add_gray_box(commands)
+    _add_step(commands)
     _add_lpv(commands)
     commands.add_parser(
         "info",
@@ -60,7 +65,11 @@ def _add_demo(commands) -> None:
     )
     demo.add_argument("--out", default="lpvid-demo", metavar="DIR", help="folder (%(default)s)")
     demo.add_argument(
-        "--runs", type=_count, default=10, metavar="N", help="noise realisations (%(default)s)"
+        "--runs",
+        type=values.count,
+        default=10,
+        metavar="N",
+        help="noise realisations (%(default)s)",
     )
     _add_seed(demo)
 
@@ -74,18 +83,87 @@ def _add_identify(commands) -> None:
     )
     identify.add_argument("files", nargs="+", metavar="FILE", help=".csv, .txt, .dat, .mat, .npz")
     _add_columns(identify)
+    _add_keep_offsets(identify)
     identify.add_argument(
-        "--order", type=_order, default="auto", metavar="N|auto", help="states (%(default)s)"
+        "--order", type=values.order, default="auto", metavar="N|auto", help="states (%(default)s)"
     )
-    _add_method(identify)
+    _add_method(identify, (*METHODS, *CONTINUOUS_METHODS))
+    identify.add_argument(
+        "--tau", type=values.seconds, metavar="S", help="filters of a continuous method (searched)"
+    )
+    identify.add_argument(
+        "--refine", action="store_true", help="refine the model by maximum likelihood"
+    )
+    identify.add_argument(
+        "--predictor",
+        choices=PREDICTORS,
+        help="what is refined: the simulation (output-error) or the one-step prediction",
+    )
     identify.add_argument(
         "--split",
-        type=_fraction,
+        type=values.fraction,
         default=0.5,
         metavar="F",
         help="share of each record to fit on (%(default)s)",
     )
     _add_files_out(identify)
+
+
+def _add_gray_box(commands) -> None:
+    gray_box = commands.add_parser(
+        "gray-box",
+        help="mass, damping and stiffness from forces and displacements",
+        description="Identify M, D and K of M y\" + D y' + K y = u in continuous time, refine them "
+        "by output error, and print them and the modes with 95 %% intervals. As many inputs "
+        "(forces) as outputs (displacements), in the same order.",
+    )
+    gray_box.add_argument("files", nargs="+", metavar="FILE", help=".csv, .txt, .dat, .mat, .npz")
+    _add_columns(gray_box)
+    gray_box.add_argument(
+        "--remove-offsets",
+        action="store_true",
+        help="take each channel's mean over the fitted part out (for sensors without a zero)",
+    )
+    gray_box.add_argument(
+        "--tau", type=values.seconds, metavar="S", help="filters' time constant (searched)"
+    )
+    gray_box.add_argument(
+        "--block-rows", type=values.block_rows, metavar="S", help="filtered rows (searched)"
+    )
+    gray_box.add_argument(
+        "--split",
+        type=values.fraction,
+        default=0.75,
+        metavar="F",
+        help="share of each record to fit on (%(default)s)",
+    )
+    _add_files_out(gray_box)
+
+
+def _add_step(commands) -> None:
+    step = commands.add_parser(
+        "step",
+        help="a continuous-time model from step records",
+        description="Identify a continuous-time model from records that start at rest and settle: "
+        "one file for each experiment, as many as inputs or more, steps of any size.",
+    )
+    step.add_argument("files", nargs="+", metavar="FILE", help=".csv, .txt, .dat, .mat, .npz")
+    _add_columns(step)
+    step.add_argument("--order", type=values.count, required=True, metavar="N", help="states")
+    step.add_argument(
+        "--method",
+        choices=STEP_METHODS,
+        default=STEP_METHODS[0],
+        help="deviation bears noise, primal and dual are the published moments (%(default)s)",
+    )
+    step.add_argument(
+        "--settled", type=values.seconds, metavar="S", help="when all has settled (looked for)"
+    )
+    step.add_argument("--refine", action="store_true", help="refine the model by output error")
+    step.add_argument(
+        "--test", action="append", default=[], metavar="FILE", help="a record to test on, from rest"
+    )
+    _add_files_out(step)
 
 
 def _add_lpv(commands) -> None:
@@ -112,11 +190,12 @@ def _add_lpv(commands) -> None:
         help="a record to test on; K may be the column of a measured schedule",
     )
     _add_columns(lpv)
-    lpv.add_argument("--order", type=_count, required=True, metavar="N", help="states")
+    _add_keep_offsets(lpv)
+    lpv.add_argument("--order", type=values.count, required=True, metavar="N", help="states")
     _add_method(lpv)
     lpv.add_argument(
         "--degree",
-        type=_degree,
+        type=values.degree,
         default="auto",
         metavar="D|auto",
         help="of the polynomial in K; auto leaves one point out in turn (%(default)s)",
@@ -125,11 +204,11 @@ def _add_lpv(commands) -> None:
         "--structure", choices=STRUCTURES, default="modal", help="of the local models (%(default)s)"
     )
     lpv.add_argument(
-        "--lengths", type=_lengths, metavar="L1,L2", help="links in metres, for two-link-arm"
+        "--lengths", type=values.lengths, metavar="L1,L2", help="links in metres, for two-link-arm"
     )
     lpv.add_argument("--measured", choices=MEASURED, help="for mechanical (displacement)")
     lpv.add_argument(
-        "--starts", type=_count, default=24, metavar="N", help="of the search (%(default)s)"
+        "--starts", type=values.count, default=24, metavar="N", help="of the search (%(default)s)"
     )
     _add_seed(lpv)
     _add_files_out(lpv)
@@ -138,19 +217,24 @@ def _add_lpv(commands) -> None:
 def _add_columns(parser) -> None:
     parser.add_argument(
         "--input",
-        type=_columns,
+        type=values.columns,
         action="extend",
         required=True,
         metavar="COL,…",
         help="input columns: names, or numbers from 1 in a table without header",
     )
-    parser.add_argument("--output", type=_columns, action="extend", required=True, metavar="COL,…")
+    parser.add_argument(
+        "--output", type=values.columns, action="extend", required=True, metavar="COL,…"
+    )
     clock = parser.add_mutually_exclusive_group(required=True)
-    clock.add_argument("--dt", type=_seconds, metavar="S", help="sample time in seconds")
+    clock.add_argument("--dt", type=values.seconds, metavar="S", help="sample time in seconds")
     clock.add_argument("--time", metavar="COL", help="time column in seconds")
     parser.add_argument(
         "--resample", action="store_true", help="bring non-uniform time to a uniform grid"
     )
+
+
+def _add_keep_offsets(parser) -> None:
     parser.add_argument(
         "--keep-offsets",
         action="store_true",
@@ -158,16 +242,19 @@ def _add_columns(parser) -> None:
     )
 
 
-def _add_method(parser) -> None:
+def _add_method(parser, choices: Sequence[str] = METHODS) -> None:
     parser.add_argument(
-        "--method", choices=METHODS, default=METHODS[0], help="of identification (%(default)s)"
+        "--method", choices=choices, default=choices[0], help="of identification (%(default)s)"
     )
     parser.add_argument(
-        "--block-rows", type=_block_rows, metavar="S", help="rows of past and future (by order)"
+        "--block-rows",
+        type=values.block_rows,
+        metavar="S",
+        help="rows of past and future (by order)",
     )
     parser.add_argument(
         "--stabilise",
-        type=_radius,
+        type=values.radius,
         nargs="?",
         const=_RADIUS,
         metavar="RADIUS",
@@ -182,88 +269,9 @@ def _add_files_out(parser) -> None:
 
 def _add_seed(parser) -> None:
     parser.add_argument(
-        "--seed", type=_seed, default=0, metavar="S", help="of the random numbers (%(default)s)"
+        "--seed",
+        type=values.seed,
+        default=0,
+        metavar="S",
+        help="of the random numbers (%(default)s)",
     )
-
-
-def _whole(text: str, least: int, most: int | None = None) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text.strip()!r} is no whole number") from None
-    if value < least:
-        raise argparse.ArgumentTypeError(f"{value} is below {least}")
-    if most is not None and value > most:
-        raise argparse.ArgumentTypeError(f"{value} is above {most}")
-    return value
-
-
-def _count(text: str) -> int:
-    return _whole(text, 1)
-
-
-def _seed(text: str) -> int:
-    return _whole(text, 0, 2**32 - 1)
-
-
-def _block_rows(text: str) -> int:
-    return _whole(text, 2)
-
-
-def _order(text: str) -> int | str:
-    try:
-        return text if text == "auto" else _whole(text, 1)
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(f"{error}; give a positive one, or auto") from None
-
-
-def _degree(text: str) -> int | str:
-    try:
-        return text if text == "auto" else _whole(text, 0)
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(f"{error}; give one from 0, or auto") from None
-
-
-def _number(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text.strip()!r} is no number") from None
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text.strip()} is not finite")
-    return value
-
-
-def _seconds(text: str) -> float:
-    value = _number(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"{value:g} is no positive number of seconds")
-    return value
-
-
-def _fraction(text: str) -> float:
-    value = _number(text)
-    if not 0 < value < 1:
-        raise argparse.ArgumentTypeError(f"{value:g} does not lie between 0 and 1")
-    return value
-
-
-def _radius(text: str) -> float:
-    value = _number(text)
-    if not 0 < value < 1:
-        raise argparse.ArgumentTypeError(f"the radius {value:g} does not lie between 0 and 1")
-    return value
-
-
-def _columns(text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",")]
-    if not all(names):
-        raise argparse.ArgumentTypeError(f"{text!r} has an empty column name")
-    return names
-
-
-def _lengths(text: str) -> tuple[float, float]:
-    values = [_number(part) for part in text.split(",")]
-    if len(values) != 2 or min(values) <= 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not two positive lengths such as 0.35,0.30")
-    return values[0], values[1]

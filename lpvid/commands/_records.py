@@ -5,11 +5,35 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+from jaxtyping import Array, Float
+
 from lpvid.commands._errors import UsageError
 from lpvid.data import IOData, Offset, preprocess, read
-from lpvid.identify import AbstractSubspaceMethod, PastInputMOESP, PastOutputMOESP
+from lpvid.identify import (
+    CVA,
+    N4SID,
+    ORSE,
+    AbstractSubspaceMethod,
+    ContinuousTimeCVA,
+    ContinuousTimeMOESP,
+    ContinuousTimeN4SID,
+    PastInputMOESP,
+    PastOutputMOESP,
+)
+from lpvid.identify.gray_box import AbstractContinuousTimeMethod
 
-_METHODS = {"po-moesp": PastOutputMOESP, "pi-moesp": PastInputMOESP}
+_METHODS = {
+    "po-moesp": PastOutputMOESP,
+    "pi-moesp": PastInputMOESP,
+    "n4sid": N4SID,
+    "cva": CVA,
+    "orse": ORSE,
+}
+_CONTINUOUS = {
+    "continuous-moesp": ContinuousTimeMOESP,
+    "continuous-n4sid": ContinuousTimeN4SID,
+    "continuous-cva": ContinuousTimeCVA,
+}
 
 
 def check_columns(arguments: argparse.Namespace) -> None:
@@ -62,10 +86,42 @@ def offsets_of(offset: Offset | None) -> dict[str, Any] | None:
     return None if offset is None else {"u": offset.u, "y": offset.y}
 
 
-def make_method(arguments: argparse.Namespace) -> AbstractSubspaceMethod:
-    """The method of identification that the arguments describe."""
+def subspace_method(arguments: argparse.Namespace) -> AbstractSubspaceMethod:
+    """The discrete-time method that the arguments describe.
+
+    With offsets removed it estimates what the means of the records leave of them.
+    """
     return _METHODS[arguments.method](
         order=arguments.order,
         block_rows=arguments.block_rows,
         stabilise=False if arguments.stabilise is None else arguments.stabilise,
+        offset=not arguments.keep_offsets,
     )
+
+
+def any_method(
+    arguments: argparse.Namespace,
+) -> AbstractSubspaceMethod | AbstractContinuousTimeMethod:
+    """The method that the arguments describe, in discrete or in continuous time.
+
+    Raises:
+        UsageError: an option that the method does not have.
+    """
+    if arguments.method not in _CONTINUOUS:
+        if arguments.tau is not None:
+            raise UsageError(f"--tau is for {', '.join(_CONTINUOUS)}")
+        return subspace_method(arguments)
+    if arguments.stabilise is not None:
+        raise UsageError(f"--stabilise is for {', '.join(_METHODS)}")
+    return _CONTINUOUS[arguments.method](
+        order=arguments.order, tau=arguments.tau, block_rows=arguments.block_rows
+    )
+
+
+def without_rest(data: IOData, offset: Offset, rest: Float[Array, " ny"]) -> tuple[IOData, Offset]:
+    """Data freed of what the means have left of the outputs' offsets, and the offsets as now known.
+
+    The mean of a record is not quite its offset: a slow response moves it.
+    """
+    whole = Offset(u=offset.u, y=offset.y + rest[None])
+    return data.replace(y=data.y - rest[None]), whole
