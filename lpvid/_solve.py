@@ -264,6 +264,8 @@ def _gain(equations: NormalEquations, step: Unknowns) -> Float[Array, ""]:
 class _Search(NamedTuple):
     point: Unknowns
     trial: Unknowns
+    kept: Any
+    first_kept: Any
     promised: Array
     equations: NormalEquations
     damping: Array
@@ -280,7 +282,7 @@ def levenberg_marquardt(
     *,
     max_steps: int | Array = 50,
     tolerance: float = 1e-8,
-) -> tuple[Unknowns, Solution]:
+) -> tuple[Unknowns, Solution, tuple[Any, Any]]:
     """Minimise a cost of many residuals from its normal equations; never raises.
 
     For long records, where the Jacobian (and a QR factorisation of it at every trial, as
@@ -299,8 +301,9 @@ def levenberg_marquardt(
             is a negative log likelihood, 1e-8 stops within 1.5e-4 standard deviations.
 
     Returns:
-        The best point seen, and the solution: `value` its shared part, `cost` infinite and
-        `nonfinite` the status where the start has no finite cost.
+        The best point seen; the solution: `value` its shared part, `cost` infinite and
+        `nonfinite` the status where the start has no finite cost; and what `cost` kept at the
+        start and at the best point.
 
     Example:
         >>> def cost(x):
@@ -320,6 +323,12 @@ def levenberg_marquardt(
         gained = search.equations.cost - value
         accepted = jnp.isfinite(value) & (gained > 0.0)
         first = search.steps == 0
+        kept_here = jax.tree.map(
+            lambda new, old: jnp.where(accepted | first, new, old), kept, search.kept
+        )
+        kept_first = jax.tree.map(
+            lambda new, old: jnp.where(first, new, old), kept, search.first_kept
+        )
         point, equations = jax.lax.cond(
             accepted,
             lambda: (search.trial, linearise(search.trial, kept)),
@@ -335,40 +344,51 @@ def levenberg_marquardt(
         lower = (point.shared <= bounds.lower) & (equations.gradient >= 0.0)
         upper = (point.shared >= bounds.upper) & (equations.gradient <= 0.0)
         held = lower | upper
-        whole = damped_step(equations, jnp.asarray(_LEAST_DAMPING), held)
+        # Both steps by one compiled solver: the whole one to judge by, the damped one to take.
+        steps = jax.vmap(damped_step, in_axes=(None, 0, 0))(
+            equations,
+            jnp.stack([jnp.asarray(_LEAST_DAMPING), damping]),
+            jnp.stack([held, held | first]),
+        )
+        whole, step = (jax.tree.map(lambda leaf, i=i: leaf[i], steps) for i in range(2))
         # Beyond the cost's own rounding no step can be judged.
         enough = tolerance + _ROUNDING * jnp.abs(equations.cost)
         converged = _gain(equations, whole) <= enough
-        step = damped_step(equations, damping, held | first)
         shared = jnp.clip(point.shared + step.shared, bounds.lower, bounds.upper)
         step = Unknowns(shared - point.shared, step.own)
-        steps = search.steps + 1
-        stuck = ~jnp.isfinite(equations.cost) | (damping > _MOST_DAMPING) | (steps >= max_steps)
+        count = search.steps + 1
+        stuck = ~jnp.isfinite(equations.cost) | (damping > _MOST_DAMPING) | (count >= max_steps)
         return _Search(
             point=point,
             trial=Unknowns(shared, point.own + step.own),
+            kept=kept_here,
+            first_kept=kept_first,
             promised=_gain(equations, step),
             equations=equations,
             damping=damping,
-            steps=steps,
+            steps=count,
             ended=converged | stuck,
             converged=converged,
         )
 
-    empty = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        jax.eval_shape(lambda x: linearise(x, cost(x)[1]), start),
+    def both(x):
+        kept = cost(x)[1]
+        return linearise(x, kept), kept
+
+    empty, nothing = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(both, start)
     )
     infinite = eqx.tree_at(lambda e: e.cost, empty, jnp.asarray(jnp.inf))
     no = jnp.asarray(False)
     zero = jnp.asarray(0.0)
-    begun = _Search(start, start, zero, infinite, zero, jnp.asarray(0), no, no)
+    begun = _Search(start, start, nothing, nothing, zero, infinite, zero, jnp.asarray(0), no, no)
     found = jax.lax.while_loop(lambda search: ~search.ended, advance, begun)
     value = found.equations.cost
     ended = Status.where(found.converged, Status.successful, Status.max_steps)
-    return found.point, Solution(
+    solution = Solution(
         value=found.point.shared,
         cost=jnp.where(jnp.isfinite(value), value, jnp.inf),
         status=Status.where(jnp.isfinite(value), ended, Status.nonfinite),
         steps=found.steps,
     )
+    return found.point, solution, (found.first_kept, found.kept)

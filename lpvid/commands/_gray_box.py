@@ -4,6 +4,7 @@ import argparse
 import time
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,7 +25,6 @@ from lpvid.identify import (
 )
 from lpvid.io import save
 from lpvid.mechanics import MassSpringDamper
-from lpvid.models import StructuredModel, c2d
 from lpvid.refinement import Refined, refine
 from lpvid.report import text_table
 
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
         f"Subspace step: filters of {float(start.tau):.4g} s, {int(start.block_rows)} rows; "
         "refined by output error."
     )
-    refined = refine(StructuredModel(start.structure, start.parameters), train)
+    refined = refine(start, train)
     figures = _figures(refined)
     scores = {"start": _scores(start, train, test), "refined": _scores(refined, train, test)}
     _print(figures, scores, train)
@@ -86,10 +86,7 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
 
 
 def _scores(found: MechanicalFit | Refined, train: IOData, test: IOData) -> dict[str, Any]:
-    model = found.model
-    model = model.state_space if isinstance(model, StructuredModel) else model
-    sampled = c2d(model, train.dt)
-    return {"train": simulation_fit(sampled, train), "test": simulation_fit(sampled, test)}
+    return {"train": simulation_fit(found, train), "test": simulation_fit(found, test)}
 
 
 def _figures(refined: Refined) -> dict[str, Any]:
@@ -127,6 +124,11 @@ def _with_deviation(function, refined: Refined, covariance) -> tuple[np.ndarray,
     value, spread = propagate(function, refined.parameters, covariance)
     count = value.size
     variance = np.diagonal(np.asarray(spread).reshape(count, count))
+    if np.any(np.asarray(refined.stats["unidentified"])):
+        # What hangs on a parameter that the records do not show is not known either.
+        slope = np.asarray(jax.jacfwd(function)(refined.parameters)).reshape(count, -1)
+        hanging = np.any(slope[:, np.asarray(refined.stats["unidentified"])] != 0.0, axis=1)
+        variance = np.where(hanging, np.inf, variance)
     deviation = np.sqrt(np.maximum(variance, 0.0)).reshape(value.shape)
     return np.asarray(value), deviation
 

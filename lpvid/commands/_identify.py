@@ -26,7 +26,7 @@ from lpvid.commands._records import (
 from lpvid.data import IOData
 from lpvid.identify import Fit, identify, simulation_fit
 from lpvid.io import save
-from lpvid.models import StateSpace, c2d
+from lpvid.models import StateSpace
 from lpvid.refinement import Innovation, OutputError, Refined, refine
 from lpvid.report import text_table
 
@@ -91,10 +91,9 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
 
 
 def _scores(model: StateSpace, train: IOData, test: IOData) -> dict[str, np.ndarray]:
-    sampled = model if model.is_discrete else c2d(model, train.dt)
     return {
-        "train": np.asarray(simulation_fit(sampled, train)),
-        "test": np.asarray(simulation_fit(sampled, test)),
+        "train": np.asarray(simulation_fit(model, train)),
+        "test": np.asarray(simulation_fit(model, test)),
     }
 
 
@@ -128,7 +127,7 @@ def poles_of(model: StateSpace, refined: Refined | None = None) -> list[dict[str
             own, poles, np.asarray(modes.frequency), np.asarray(modes.damping), strict=True
         )
     ]
-    if refined is None:
+    if refined is None or bool(jnp.any(refined.stats["unidentified"])):
         return found
     spread = pole_covariance(refined.model_at, refined.parameters, refined.robust_covariance)
     for pole in found:
@@ -165,7 +164,7 @@ def _print(
         for pole in poles
         if pole["im"] >= 0.0
     ]
-    sure = ["95 %"] if arguments.refine else []
+    sure = ["95 %"] if "damping_std" in poles[0] else []
     header = ["frequency (Hz)", *sure, "damping", *sure, f"pole ({domain})"]
     print(text_table(rows, header) + "\n")
     table = [

@@ -50,10 +50,18 @@ class SingleLinkMotion(eqx.Module):
         Args:
             dt: sample time of the simulation, s.
 
+        Raises:
+            ValueError: the integrator diverged.
+
         Warns:
             UserWarning: the hub left its ±80°, where the arm of 002 would have hit its stop.
         """
         angle = self.largest_angle
+        if not isinstance(angle, Tracer) and self.status == Status.nonfinite:
+            raise ValueError(
+                "substeps: the integrator diverged, its steps are too long for the fastest mode; "
+                "raise substeps, or take fewer modes."
+            )
         if not isinstance(angle, Tracer) and float(angle) > TRAVEL:
             warnings.warn(
                 f"The hub turned to {np.rad2deg(float(angle)):.0f}°, beyond its travel of ±80°: "

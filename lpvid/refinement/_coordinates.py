@@ -84,15 +84,8 @@ def select(
         raise ValueError("fixed: every parameter is fixed; leave one to be estimated.")
     mask = np.zeros(len(names))
     mask[sorted(held)] = 1.0
-    return Selection(values * jnp.asarray(mask), jnp.asarray(np.stack(columns, axis=1)))
-
-
-def gauge_size(selection: Selection, gauge: np.ndarray, units: np.ndarray) -> int:
-    """How many directions of the gauge remain when some values are fixed or tied."""
-    outside = _outside(selection.matrix / jnp.asarray(units)[:, None], jnp.asarray(gauge))
-    values = np.linalg.svd(np.asarray(outside), compute_uv=False)
-    size = np.linalg.norm(gauge, 2)
-    return gauge.shape[1] - int(np.sum(values > 1e-9 * max(size, 1e-300)))
+    constant = values * jnp.asarray(mask) if held else jnp.zeros(len(names))
+    return Selection(constant, jnp.asarray(np.stack(columns, axis=1)))
 
 
 def _outside(matrix: Array, gauge: Array) -> Array:

@@ -48,20 +48,14 @@ class Problem(eqx.Module):
 
     def residual(self, unknowns: Unknowns) -> Residual:
         """y − ŷ of every record, zero where nothing was measured."""
-        return self.residual_at(self.values(unknowns.shared), unknowns.own)
-
-    def residual_at(
-        self, values: Float[Array, " value"], own: Float[Array, "record own"]
-    ) -> Residual:
-        """The residual of a model with these values."""
-        prepared = self.parameterisation.prepare(values)
+        prepared = self.parameterisation.prepare(self.values(unknowns.shared))
 
         def one(each):
             record, mask, own, x0 = each
             y = self.parameterisation.respond(prepared, record, self._start(own, x0))
             return jnp.where(mask[:, None], record.y - y, 0.0)
 
-        return over_records(one, (self.records, self.mask, own, self.x0))
+        return over_records(one, (self.records, self.mask, unknowns.own, self.x0))
 
     def cost(self, unknowns: Unknowns) -> tuple[Float[Array, ""], Residual]:
         """The loss, and the residual."""

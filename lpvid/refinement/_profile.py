@@ -91,7 +91,8 @@ def profile_likelihood(
         The increase of the cost at every value.
 
     Raises:
-        ValueError: the parameter is unknown, fixed, or an entry of a black box.
+        ValueError: the parameter is unknown, fixed, or an entry of a black box, or the loss is
+            robust.
 
     Example:
         >>> import numpy as np
@@ -107,6 +108,13 @@ def profile_likelihood(
         (2,)
     """
     task = refined.task
+    if task.loss.rounds > 1:
+        raise ValueError(
+            "refined: a robust loss is no likelihood (its scale is estimated apart); refine with "
+            "SquaredLoss() for a profile."
+        )
+    if refined.output_offset is not None:
+        data = data.replace(y=data.y - refined.output_offset[None])
     if task.parameterisation.gauge(refined.parameters) is not None:
         raise ValueError(
             "refined: the entries of a black box depend on the basis of its state; profile a "
@@ -140,7 +148,7 @@ def profile_likelihood(
                 task.bounds.upper.at[column].set(values[i]),
             )
             there = eqx.tree_at(lambda t: t.bounds, task, held)
-            chosen, starts, solution = search(
+            chosen, starts, solution, _ = search(
                 there, *records, chosen, starts, jnp.asarray(max_steps)
             )
             increase[i] = float(solution.cost - refined.cost)

@@ -1,5 +1,6 @@
 """Which kind of model was given, and where its values start."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,14 +22,14 @@ from lpvid.refinement._parameterisation import (
     free_units,
 )
 from lpvid.refinement._predictors import AbstractPredictor, Innovation
+from lpvid.refinement._refined import Refined
 
 
 class Start(NamedTuple):
-    """A kind of model, and its values and initial states at the start."""
+    """A kind of model, and its values at the start."""
 
     parameterisation: AbstractParameterisation
     values: Float[Array, " value"]
-    x0: Float[Array, "record nx"] | None
 
 
 def recognise(model: Any, data: IOData, predictor: AbstractPredictor) -> Start:
@@ -39,16 +40,19 @@ def recognise(model: Any, data: IOData, predictor: AbstractPredictor) -> Start:
     """
     gain = predictor.gain if isinstance(predictor, Innovation) else None
     estimates_gain = isinstance(predictor, Innovation)
-    if isinstance(model, Fit):
+    feedthrough = None
+    if isinstance(model, Fit | Refined):
         if gain is None and estimates_gain:
-            gain = getattr(model, "innovation_gain", None)
+            gain = model.innovation_gain
+        # Said by the fit, so that it is known under jit too.
+        feedthrough = model.moments.feedthrough if isinstance(model, Fit) else None
         model = model.model
     if isinstance(model, MechanicalFit):
         model = StructuredModel(model.structure, model.parameters)
     if isinstance(model, ContinuousTimeFit | StepResponseFit):
         model = model.model
     if isinstance(model, StateSpace):
-        return _black_box(model, data, estimates_gain, gain)
+        return _black_box(model, data, estimates_gain, gain, feedthrough)
     if isinstance(model, StructuredModel):
         return _structured(model, data, estimates_gain, gain)
     if isinstance(model, eqx.Module) and callable(getattr(model, "simulate", None)):
@@ -82,27 +86,33 @@ def _gain(gain: Array | None, nx: int, ny: int) -> Array:
     return gain
 
 
-def _black_box(model: StateSpace, data: IOData, estimates_gain: bool, gain) -> Start:
+def _black_box(
+    model: StateSpace, data: IOData, estimates_gain: bool, gain, feedthrough: bool | None
+) -> Start:
     _check(model, data)
     nx, ny = model.nx, model.ny
-    known_zero = not isinstance(model.D, Tracer) and not np.any(np.asarray(model.D))
-    A, B, C, K = _balanced(model, data.u, data.y, _gain(gain, nx, ny))
-    blocks = [A, B, C, *(() if known_zero else (model.D,)), *((K,) if estimates_gain else ())]
+    if feedthrough is None:
+        feedthrough = isinstance(model.D, Tracer) or bool(np.any(np.asarray(model.D)))
+    values, units = _balanced(
+        model, data.u, data.y, _gain(gain, nx, ny), feedthrough, estimates_gain
+    )
     kind = LinearParameterisation(
-        structure=FreeStructure(nx, model.nu, ny, feedthrough=not known_zero),
+        structure=FreeStructure(nx, model.nu, ny, feedthrough=feedthrough),
         dt=data.dt,
         discrete=model.is_discrete,
         black_box=True,
         gain=estimates_gain,
         sizes=(nx, model.nu, ny),
-        units=free_units(A, data.u, data.y, feedthrough=not known_zero, gain=estimates_gain),
+        units=units,
     )
-    return Start(kind, jnp.concatenate([block.reshape(-1) for block in blocks]), None)
+    return Start(kind, values)
 
 
-@jax.jit
-def _balanced(model: StateSpace, u: Array, y: Array, gain: Array) -> tuple[Array, ...]:
-    """A, B, C, K balanced for channels of one size, so that all entries matter about equally.
+@partial(jax.jit, static_argnums=(4, 5))
+def _balanced(
+    model: StateSpace, u: Array, y: Array, gain: Array, feedthrough: bool, estimates_gain: bool
+) -> tuple[Array, Array]:
+    """Entries balanced for channels of one size, so that all matter about equally; their units.
 
     As they were, where there is no balanced form (unstable, not minimal).
     """
@@ -113,7 +123,10 @@ def _balanced(model: StateSpace, u: Array, y: Array, gain: Array) -> tuple[Array
     moved = (forward @ model.A @ backward, forward @ model.B, model.C @ backward, forward @ gain)
     size = jnp.linalg.norm(forward) * jnp.linalg.norm(backward)
     good = jnp.isfinite(size) & (jnp.max(jnp.abs(forward @ backward - jnp.eye(model.nx))) < 1e-6)
-    return tuple(jnp.where(good, new, old) for new, old in zip(moved, given, strict=True))
+    A, B, C, K = (jnp.where(good, new, old) for new, old in zip(moved, given, strict=True))
+    blocks = [A, B, C, *((model.D,) if feedthrough else ()), *((K,) if estimates_gain else ())]
+    values = jnp.concatenate([block.reshape(-1) for block in blocks])
+    return values, free_units(A, u, y, feedthrough=feedthrough, gain=estimates_gain)
 
 
 def _structured(model: StructuredModel, data: IOData, estimates_gain: bool, gain) -> Start:
@@ -131,7 +144,7 @@ def _structured(model: StructuredModel, data: IOData, estimates_gain: bool, gain
         sizes=(frozen.nx, frozen.nu, frozen.ny),
         units=jnp.ones_like(values),
     )
-    return Start(kind, values, None)
+    return Start(kind, values)
 
 
 def _module(model: Any, data: IOData, estimates_gain: bool) -> Start:
@@ -155,4 +168,4 @@ def _module(model: Any, data: IOData, estimates_gain: bool) -> Start:
             f"model: its simulate gives {shape.shape} for two samples; this data needs "
             f"(2, {data.ny})."
         )
-    return Start(kind, values, None)
+    return Start(kind, values)

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -13,10 +14,11 @@ from jaxtyping import Array, ArrayLike, Float
 from lpvid._results import Status
 from lpvid._solve import Bounds
 from lpvid.data import IOData
-from lpvid.refinement._coordinates import Ties, gauge_size, matching, select
+from lpvid.refinement._coordinates import Selection, Ties, matching, select
 from lpvid.refinement._losses import AbstractLoss, SquaredLoss
 from lpvid.refinement._parameterisation import (
     AbstractParameterisation,
+    LinearParameterisation,
     Record,
     cut_up,
     padded_records,
@@ -24,7 +26,7 @@ from lpvid.refinement._parameterisation import (
 from lpvid.refinement._predictors import AbstractPredictor, OutputError
 from lpvid.refinement._recognise import Start, recognise
 from lpvid.refinement._refined import Refined
-from lpvid.refinement._search import Outcome, Task, assess, search
+from lpvid.refinement._search import Outcome, Task, assess, search, start_residual
 
 # How much longer the pieces of a shooting search become each time.
 _LONGER = 8
@@ -59,18 +61,20 @@ def refine(
     record's Jacobian; records are padded to the longest.
 
     Args:
-        model: `StateSpace` (discrete at the data's sample time, or continuous: zero-order hold),
-            `Fit`, `StructuredModel`, `LPVStateSpace` (its coefficients, along the data's
-            `kappa`), or any `eqx.Module` with `simulate(u=, dt=, x0=)`, whose inexact arrays are
-            the parameters and whose `n_states` (or `nx`) says how long x0 is; without it, x0 is
-            not passed.
+        model: what `identify`, `identify_mechanical`, `identify_step_response` or `refine` returned
+            (an output offset is taken out of the data and kept as it is), a `StateSpace` (discrete
+            at the data's sample time, or continuous: zero-order hold), `StructuredModel`,
+            `LPVStateSpace` (its coefficients, along the data's `kappa`), or any `eqx.Module` with
+            `simulate(u=, dt=, x0=)`, whose inexact arrays are the parameters and whose `n_states`
+            (or `nx`) says how long x0 is; without it, x0 is not passed.
         data: one or several records.
         predictor: `OutputError()` by default, or `Innovation()`.
         loss: `SquaredLoss()` by default, or `HuberLoss()`.
         bounds: lower and upper bound by parameter name (* and ? are wildcards), in place of the
             structure's own.
         fixed: names of parameters that keep the value they start with.
-        tied: names of parameters that share one value: a pattern, or several patterns, a group.
+        tied: names of parameters that share one value: a pattern, or several patterns, a group. Of
+            a black box, `fixed` and `tied` may name entries of D alone.
         initial_state: `"free"` (estimated, one a record), `"zero"`, or known states (nx,) or
             (record, nx).
         max_steps: limit on the trial steps.
@@ -106,13 +110,19 @@ def refine(
         raise ValueError(f"loss={loss!r}: give SquaredLoss() or HuberLoss().")
     if max_steps < 1:
         raise ValueError(f"max_steps: at least 1 is needed, got {max_steps}.")
+    offset = getattr(model, "output_offset", None)
+    if offset is not None:
+        data = data.replace(y=data.y - offset[None])
     start = recognise(model, data, predictor)
     task, chosen, own = prepare(start, data, loss, bounds, fixed, tied, initial_state)
     records = padded_records(data)
     found, starts = _shoot(task, records, predictor, chosen, own, max_steps)
-    found, starts, solution = search(task, *records, found, starts, jnp.asarray(max_steps))
-    outcome = assess(task, *records, chosen, own, found, starts, solution)
-    refined = as_refined(task, outcome, data)
+    shot = found is not chosen
+    found, starts, solution, ends = search(task, *records, found, starts, jnp.asarray(max_steps))
+    if shot:
+        ends = start_residual(task, *records, chosen, own), ends[1]
+    outcome = assess(task, *records, found, starts, solution, ends)
+    refined = as_refined(task, outcome, data, offset)
     if not isinstance(refined.cost, Tracer):
         _report(refined, throw)
     return refined
@@ -143,7 +153,7 @@ def _shoot(
         pieces = pieces[:, covering].reshape(-1, own.shape[1])
         states = jnp.zeros((pieces.shape[0], task.x0.shape[1]))
         piecewise = eqx.tree_at(lambda t: t.x0, task, states)
-        chosen, pieces, _ = search(piecewise, *cut, chosen, pieces, jnp.asarray(max_steps))
+        chosen, pieces, _, _ = search(piecewise, *cut, chosen, pieces, jnp.asarray(max_steps))
         length *= _LONGER
     return chosen, pieces.reshape(count, -1, own.shape[1])[:, 0]
 
@@ -161,22 +171,22 @@ def prepare(
     kind = start.parameterisation
     selection = select(kind.names, start.values, fixed, tied)
     lower, upper = _bounds(kind, bounds)
-    gauge = kind.gauge(start.values)
+    black_box = isinstance(kind, LinearParameterisation) and kind.black_box
     remaining = 0
-    if gauge is not None:
-        remaining = gauge.shape[1]
-        if fixed or tied:
-            if isinstance(gauge, Tracer):
-                raise ValueError(
-                    "fixed, tied: a black box's entries can be held for a model with known numbers "
-                    "only, not for one that jit, vmap or lax.map carries."
-                )
-            remaining = gauge_size(selection, np.asarray(gauge), np.asarray(kind.scale))
-    membership = selection.matrix > 0.0
-    inner_lower = jnp.max(jnp.where(membership, lower[:, None], -jnp.inf), axis=0)
-    inner_upper = jnp.min(jnp.where(membership, upper[:, None], jnp.inf), axis=0)
-    free, x0 = _initial_state(initial_state, kind, gauge is not None, len(data.lengths))
-    own = start.x0 if start.x0 is not None else jnp.zeros((len(data.lengths), kind.n_states))
+    if black_box:
+        remaining = kind.n_states**2
+        _check_basis_free(kind, fixed, tied)
+    for pattern in bounds or ():
+        rows = matching(kind.names, pattern, "bounds")
+        if isinstance(selection.matrix, Tracer):
+            break
+        if not np.all(np.any(np.asarray(selection.matrix)[rows] > 0.0, axis=1)):
+            raise ValueError(
+                f"bounds[{pattern!r}]: names a parameter that is fixed; leave one of the two out."
+            )
+    chosen, inner_lower, inner_upper = _chosen(selection, start.values, lower, upper)
+    free, x0 = _initial_state(initial_state, kind, black_box, len(data.lengths))
+    own = jnp.zeros((len(data.lengths), kind.n_states if free else 0))
     task = Task(
         parameterisation=kind,
         loss=loss,
@@ -186,7 +196,31 @@ def prepare(
         free_start=free,
         remaining=remaining,
     )
-    return task, selection.chosen(start.values), own if free else own[:, :0]
+    return task, chosen, own
+
+
+def _check_basis_free(kind: AbstractParameterisation, fixed: Sequence[str], tied: Ties) -> None:
+    """Raise where something is to be held that depends on the basis of the state."""
+    groups = [[pattern] if isinstance(pattern, str) else pattern for pattern in tied]
+    for pattern in (*fixed, *(pattern for group in groups for pattern in group)):
+        names = [kind.names[i] for i in matching(kind.names, pattern, "fixed, tied")]
+        if any(not name.startswith("D") for name in names):
+            raise ValueError(
+                f"fixed, tied: {pattern!r} names entries that depend on the basis of the state, "
+                "which the search of a black box changes; hold entries of D only, or give a "
+                "StructuredModel."
+            )
+
+
+@jax.jit
+def _chosen(
+    selection: Selection, values: Array, lower: Array, upper: Array
+) -> tuple[Array, Array, Array]:
+    """The chosen values of all, and their bounds: the narrowest of what is tied."""
+    membership = selection.matrix > 0.0
+    inner_lower = jnp.max(jnp.where(membership, lower[:, None], -jnp.inf), axis=0)
+    inner_upper = jnp.min(jnp.where(membership, upper[:, None], jnp.inf), axis=0)
+    return selection.chosen(values), inner_lower, inner_upper
 
 
 def _bounds(
@@ -195,10 +229,10 @@ def _bounds(
     lower, upper = kind.bounds()
     if not given:
         return lower, upper
-    if isinstance(kind.gauge(jnp.zeros(len(kind.names))), Array):
+    if isinstance(kind, LinearParameterisation) and kind.black_box:
         raise ValueError(
             "bounds: the entries of a black box depend on the basis of its state, so they have no "
-            "bounds; give StructuredModel(FreeStructure(...), ...) to bound them in one basis."
+            "bounds; give a StructuredModel, for example of a ModalStructure."
         )
     for pattern, ends in given.items():
         low, high = (float(end) for end in ends)
@@ -231,7 +265,9 @@ def _initial_state(
     return False, jnp.broadcast_to(states, zero.shape)
 
 
-def as_refined(task: Task, outcome: Outcome, data: IOData) -> Refined:
+def as_refined(
+    task: Task, outcome: Outcome, data: IOData, offset: Float[Array, " ny"] | None
+) -> Refined:
     """The public record of an outcome."""
     kind = task.parameterisation
     pieces = [outcome.residual[i, :length] for i, length in enumerate(data.lengths)]
@@ -242,6 +278,7 @@ def as_refined(task: Task, outcome: Outcome, data: IOData) -> Refined:
         covariance=outcome.covariance,
         robust_covariance=outcome.robust_covariance,
         x0=outcome.x0,
+        output_offset=offset,
         innovation_gain=kind.innovation_gain(outcome.values),
         noise_covariance=outcome.noise_covariance,
         residual=jnp.concatenate(pieces),

@@ -25,10 +25,12 @@ class Refined(eqx.Module):
             `lpvid.analysis.propagate(function, parameters, covariance)`.
         robust_covariance: the same for noise of any colour that is independent of the input.
         x0: initial states, (record, nx).
+        output_offset: constant in the outputs that the fit given came with, taken out and not
+            refined, (ny,); None where there was none.
         innovation_gain: K, (nx, ny), or None where it was not estimated.
         noise_covariance: of the residual, corrected for the unknowns estimated, (ny, ny).
         residual: y − ŷ, records one after the other as in the data, (time, ny).
-        cost: the loss, a negative log likelihood up to a constant.
+        cost: the loss; of `SquaredLoss` a negative log likelihood up to a constant.
         initial_cost: the loss at the start.
         status: how it ended; `advice` says it with the parameters' names.
         stats: arrays by name: `steps`, `degrees_of_freedom` (unknowns estimated), `unidentified`
@@ -42,6 +44,7 @@ class Refined(eqx.Module):
     covariance: Float[Array, "parameter parameter"]
     robust_covariance: Float[Array, "parameter parameter"]
     x0: Float[Array, "record nx"]
+    output_offset: Float[Array, " ny"] | None
     innovation_gain: Float[Array, "nx ny"] | None
     noise_covariance: Float[Array, "ny ny"]
     residual: Float[Array, "time ny"]

@@ -10,7 +10,7 @@ from lpvid._solve import Bounds, Unknowns, levenberg_marquardt
 from lpvid.refinement._coordinates import Selection, complement
 from lpvid.refinement._covariance import uncertainty
 from lpvid.refinement._criterion import Problem
-from lpvid.refinement._losses import AbstractLoss, Mask, covariance, rounding_floor
+from lpvid.refinement._losses import AbstractLoss, Mask, Residual, covariance, rounding_floor
 from lpvid.refinement._parameterisation import AbstractParameterisation, Record
 
 # Residual variance over the output's power that says a simulation has grown out of bounds.
@@ -116,8 +116,8 @@ def search(
     start: Float[Array, " chosen"],
     own: Float[Array, "record own"],
     max_steps: Array,
-) -> tuple[Array, Array, Solution]:
-    """Minimise from one start: chosen values, initial states, and how it ended.
+) -> tuple[Array, Array, Solution, tuple[Residual, Residual]]:
+    """Minimise from one start: chosen values, initial states, how it ended, residuals at both ends.
 
     A black box is searched in local coordinates, renewed once at the first solution; a robust loss
     renews its scale.
@@ -129,7 +129,7 @@ def search(
         problem, local = task.problem(records, mask, chosen)
         begin = Unknowns(jnp.zeros(local.shape[1]), own)
         problem = task.scaled(problem, begin) if task.loss.rounds > 1 else problem
-        point, solution = levenberg_marquardt(
+        point, solution, residuals = levenberg_marquardt(
             problem.cost,
             problem.linearise,
             begin,
@@ -137,13 +137,22 @@ def search(
             max_steps=jnp.maximum(max_steps - before, 1),
         )
         steps = before + solution.steps
-        return (chosen + local @ point.shared, point.own, steps), (solution.cost, solution.status)
+        chosen = chosen + local @ point.shared
+        return (chosen, point.own, steps), (solution.cost, solution.status, residuals)
 
     rounds = max(task.loss.rounds, 2 if task.remaining else 1)
     carry = (start, own, jnp.asarray(0))
-    (chosen, own, steps), (costs, statuses) = jax.lax.scan(one_round, carry, length=rounds)
-    last = jax.tree.map(lambda leaf: leaf[-1], statuses)
-    return chosen, own, Solution(value=chosen, cost=costs[-1], status=last, steps=steps)
+    (chosen, own, steps), every = jax.lax.scan(one_round, carry, length=rounds)
+    cost, status, (_, residual) = jax.tree.map(lambda leaf: leaf[-1], every)
+    ends = every[2][0][0], residual
+    return chosen, own, Solution(value=chosen, cost=cost, status=status, steps=steps), ends
+
+
+@eqx.filter_jit
+def start_residual(task: Task, records: Record, mask: Mask, chosen: Array, own: Array) -> Residual:
+    """The residual before a search."""
+    problem, local = task.problem(records, mask, chosen)
+    return problem.residual(Unknowns(jnp.zeros(local.shape[1]), own))
 
 
 @eqx.filter_jit
@@ -151,21 +160,30 @@ def assess(
     task: Task,
     records: Record,
     mask: Mask,
-    start: Array,
-    first_own: Array,
     chosen: Array,
     own: Array,
     solution: Solution,
+    ends: tuple[Residual, Residual],
 ) -> Outcome:
-    """What is known at a solution: residual, covariances, and what cannot be told."""
+    """What is known at a solution: covariances, and what cannot be told.
+
+    Args:
+        task: what was fitted.
+        records: to these.
+        mask: where they count.
+        chosen: the solution.
+        own: its initial states.
+        solution: how the search ended.
+        ends: residuals at the start and at the solution.
+    """
     problem, local = task.problem(records, mask, chosen)
     plain = not task.remaining
-    # One compiled simulation serves both ends of the search.
-    ends = jnp.stack([task.selection.values(start), problem.base]), jnp.stack([first_own, own])
-    first, residual = jax.lax.map(lambda end: problem.residual_at(*end), ends)
+    residual = ends[1]
     scale = task.loss.scale(residual, mask, problem.floor)
     problem = eqx.tree_at(lambda p: p.scale, problem, scale)
-    costs = [task.loss.cost(each, mask, scale, problem.floor) for each in (first, residual)]
+    costs = jax.lax.map(
+        lambda each: task.loss.cost(each, mask, scale, problem.floor), jnp.stack(ends)
+    )
     held = jnp.zeros(local.shape[1], bool)
     if plain:
         slack = 1e-9 * jnp.abs(chosen)

@@ -140,6 +140,7 @@ def test_gradient_against_differences(dt):
         np.testing.assert_allclose(jnp.sum(gradient[index] * direction), difference, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_forward_derivative_equals_reverse():
     rng = np.random.default_rng(11)
     matrices = tuple(jnp.asarray(m) for m in modal_system(rng, 6, 2, 2, feedthrough=0.3))
@@ -150,6 +151,7 @@ def test_forward_derivative_equals_reverse():
     np.testing.assert_allclose(forward(matrices, tangents), total, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_batches_equal_single_systems():
     rng = np.random.default_rng(9)
     # Unlike cases in one batch: the general route of one must not disturb the others.

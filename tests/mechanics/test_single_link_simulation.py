@@ -197,6 +197,7 @@ class Lagging(SampledController):
         return (command, count + 1), command
 
 
+@pytest.mark.slow
 def test_controllers_batch_over_payloads_set_points_and_noise():
     effects = ArmEffects(friction=DryFriction(0.4), noise=0.01, quantisation=Quantisation())
     payloads, set_points = jnp.array([0.0, 0.2, 0.4]), jnp.array([1.0, 3.0, 5.0])

@@ -247,6 +247,7 @@ def stiffness_slopes():
     return np.asarray(costs[:2] - costs[2:]) / 2e-4
 
 
+@pytest.mark.slow
 def test_gradient_of_a_simulation_with_respect_to_the_stiffnesses():
     gradient = jax.jit(jax.jacfwd(stiffness_cost))(jnp.array([40.0, 18.0]))
     np.testing.assert_allclose(gradient, stiffness_slopes(), rtol=1e-5)

@@ -80,6 +80,7 @@ def test_a_given_reference_sets_the_basis():
     np.testing.assert_allclose(mean.B, truth.B, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_failed_models_are_left_out_and_batches_are_taken():
     truth = flexible().discretise(0.02)
     systems = [truth, truth.transform(-2.0 * np.eye(6))]

@@ -110,6 +110,7 @@ def test_time_varying_agrees_with_the_recursion_and_with_constant_matrices():
     np.testing.assert_allclose(simulate_time_varying(*varying, u=u), expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_time_varying_gradients():
     rng = np.random.default_rng(5)
     shapes = ((9, 2, 2), (9, 2, 1), (9, 1, 2), (9, 1, 1), (9, 1), (2,))

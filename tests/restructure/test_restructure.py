@@ -46,6 +46,7 @@ def arm_point(request):
     return theta2, restructure(black_box, ARM_STRUCTURE, starts=24, key=KEY)
 
 
+@pytest.mark.slow
 def test_the_arm_is_recovered_without_a_nominal(arm_point):
     theta2, best = arm_point
     truth = np.asarray(ARM.structured_parameters(theta2)).reshape(4, 4)
@@ -255,6 +256,7 @@ class Spring(AbstractStructure):
         return jnp.full((count, 1), jnp.where(jnp.abs(frequency - 5.0) < 0.01, 1e4, frequency))
 
 
+@pytest.mark.slow
 def test_neighbours_replace_a_poor_minimum():
     structure, frequencies = Spring(), [4.9, 5.0, 5.1]
     boxes = [structure.matrices(jnp.array([f])) for f in frequencies]
@@ -325,6 +327,7 @@ def test_a_useless_match_and_an_unstable_black_box_are_not_called_successful():
         assert best.status == Status.poor_match
 
 
+@pytest.mark.slow
 def test_modes_that_cross_keep_their_places():
     structure = ModalStructure(2, n_inputs=1, n_outputs=1)
     kappas = np.linspace(0.0, 1.0, 5)
