@@ -99,8 +99,10 @@ def check_varying(data: IOData, still: np.ndarray | None = None) -> None:
         ValueError: naming the first one found.
     """
     if still is None:
-        array = np.concatenate([np.asarray(data.u), np.asarray(data.y)], axis=1)
-        still = np.asarray(np.ptp(array, axis=0) <= 1e-12 * np.abs(array).max(axis=0))
+        signals = [np.asarray(data.u), np.asarray(data.y)]
+        low = np.concatenate([signal.min(axis=0) for signal in signals])
+        high = np.concatenate([signal.max(axis=0) for signal in signals])
+        still = constant_channels(low, high)
     names = [*data.input_names, *data.output_names]
     for channel in np.flatnonzero(still):
         kind, remedy = (
@@ -111,6 +113,22 @@ def check_varying(data: IOData, still: np.ndarray | None = None) -> None:
         raise ValueError(
             f"{kind} {names[channel]!r} is constant, so nothing can be learned from it: {remedy}."
         )
+
+
+def constant_channels(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Which channels do not move, from their least and largest samples."""
+    return high - low <= 1e-12 * np.maximum(np.abs(high), np.abs(low))
+
+
+def above_rank(order: int, singular_values: np.ndarray, rounding: float) -> str | None:
+    """A warning where an order reaches singular values that are rounding, else `None`."""
+    if not singular_values[order - 1] <= rounding * singular_values[0]:
+        return None
+    rank = int(np.sum(singular_values > rounding * singular_values[0]))
+    return (
+        f"order={order} is above the numerical rank of the data ({rank}): the states beyond it are "
+        f"rounding noise. Use order={rank}, or data that excite more modes."
+    )
 
 
 def describe_excitation(data: IOData, layout: Layout, constant: bool) -> str:
@@ -171,8 +189,3 @@ def largest_order(block_rows: int, ny: int) -> int:
 def negligible(route: Route) -> float:
     """Share of the largest singular value below which one is rounding."""
     return 1e-6 if route == "gram" else 1e-11
-
-
-def resolve_block_rows(method: AbstractSubspaceMethod, data: IOData) -> int:
-    """Block rows of `make_layout` for records in memory."""
-    return make_layout(method, data, data.lengths).block_rows

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array
 
 from lpvid.data import IOData
-from lpvid.identify._checks import check_varying, require_samples
+from lpvid.identify._checks import check_varying, constant_channels, require_samples
 from lpvid.identify._engine import (
-    centre_and_scale,
+    channel_scale,
     finish,
     range_of_moments,
     range_of_triangle,
@@ -176,8 +176,10 @@ class ChunkedSource:
 
     @property
     def data(self) -> IOData:
-        """Samples to look at for the channel at fault: the first chunk's."""
-        return self.first
+        """Samples to look at for the channel at fault: the first piece's (chunks may be short)."""
+        u, y = next(self.chunks.pieces(self.first, _PIECE))
+        names = {"u": self.first.input_names, "y": self.first.output_names}
+        return IOData(u=u, y=y, dt=self.first.dt, names=names)
 
     def check_varying(self) -> None:
         """Raise for a constant channel."""
@@ -227,9 +229,9 @@ class ChunkedSource:
             padded = np.pad(w, ((0, _PIECE - len(w)), (0, 0)))
             lagged, total, square = _add(lagged, total, square, carry, padded)
             carry = np.concatenate([carry, w])[-edge:]
-        self.still = high - low <= 1e-12 * np.maximum(np.abs(high), np.abs(low))
+        self.still = constant_channels(low, high)
         require_samples(layout, self.lengths)
-        _, scale = centre_and_scale(total, square, self.n_samples, self.method.offset)
+        scale = channel_scale(total, square, self.n_samples, self.method.offset)
         moments = HankelMoments(
             lagged=lagged,
             heads=jnp.asarray(head[None]),
@@ -251,14 +253,17 @@ class ChunkedSource:
         samples = self.n_samples
         if len(windows) > 1:
             u, y = next(self.chunks.pieces(self.first, _PIECE))
-            count = max(len(u) // windows[0], 1)
-            samples = count * windows[0]
+            # A window may be longer than the piece.
+            window = min(windows[0], len(u))
+            lengths = (window,) * (len(u) // window)
+            samples = sum(lengths)
             equations = _windowed(
-                found, A, C, u[:samples], y[:samples], offset=offset, lengths=windows[:1] * count
+                found, A, C, u[:samples], y[:samples], offset=offset, lengths=lengths
             )
         else:
             equations = self._equations(found, A, C, offset)
-        return _finish(found, A, C, moved, equations, rounding, samples=samples, **settings)
+        done = _finish(found, A, C, moved, equations, rounding, samples=samples, **settings)
+        return done | dict(samples=samples)
 
     def _equations(self, found, A, C, offset: bool) -> NormalEquations:
         """Normal equations of the whole record, the regressors handed from piece to piece."""

@@ -28,15 +28,15 @@ from lpvid.identify._simulation_error import NormalEquations, record_equations
 STABILITY_MARGIN = 1e-8
 
 
-def centre_and_scale(
+def channel_scale(
     total: Float[Array, " channel"], square: Float[Array, " channel"], n: int, offset: bool
-) -> tuple[Float[Array, " channel"], Float[Array, " channel"]]:
-    """What is taken from every channel and what it is divided by, from its sums over n samples."""
+) -> Float[Array, " channel"]:
+    """What every channel is divided by, from its sums over n samples near their mean."""
     mean = total / n
-    power = square / n
-    centre = mean if offset else jnp.zeros_like(mean)
-    power = power - mean * mean if offset else power
-    return centre, jnp.where(power > 0.0, jnp.sqrt(jnp.maximum(power, 0.0)), 1.0)
+    power = square / n - mean * mean if offset else square / n
+    # Not by the root of zero: its derivative is not finite.
+    moves = power > 0.0
+    return jnp.where(moves, jnp.sqrt(jnp.where(moves, power, 1.0)), 1.0)
 
 
 @functools.partial(jax.jit, static_argnames=("method", "layout", "lengths", "route", "correlate"))
@@ -47,8 +47,8 @@ def range_of_records(u, y, *, method, layout, lengths, route, correlate):
     if method.offset:
         centre = jnp.mean(w, axis=0)
         w = w - centre[None]
-    power = jnp.sqrt(jnp.mean(w * w, axis=0))
-    scale = jnp.where(power > 0.0, power, 1.0)
+    total, square = jnp.sum(w, axis=0), jnp.sum(w * w, axis=0)
+    scale = channel_scale(total, square, w.shape[0], method.offset)
     columns = layout.columns(lengths)
     if route == "qr":
         whole = hankel_factor(w / scale[None], lengths, layout.rows(), constant=method.offset)

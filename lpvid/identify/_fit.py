@@ -4,10 +4,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from lpvid._results import Status
-from lpvid.identify._innovation import Innovation, Projections, innovation
+from lpvid.identify._innovation import InnovationModel, Projections, innovation
 from lpvid.identify._linear_fit import LinearCovariance, covariance
 from lpvid.models import StateSpace
 
@@ -18,7 +18,9 @@ class Moments(eqx.Module):
     Attributes:
         scale: RMS of every channel, by which it was divided.
         projections: of the data, for a method with past outputs; else `None`.
-        normal_matrix: matrix of the normal equations of B, D and x0, by record and output.
+        normal_matrix: matrix of the normal equations of B, D and x0, by window and output.
+        firsts: which windows start a record, where the state is freed within records; `None` where
+            every window is a record.
         columns: of the data matrix.
         dilution: samples over samples less unknowns, by which a residual's variance is too small.
         feedthrough: whether D was estimated.
@@ -27,7 +29,8 @@ class Moments(eqx.Module):
 
     scale: Float[Array, " channel"]
     projections: Projections | None
-    normal_matrix: Float[Array, "record ny entry entry"]
+    normal_matrix: Float[Array, "window ny entry entry"]
+    firsts: Int[Array, " record"] | None
     columns: int = eqx.field(static=True)
     dilution: float = eqx.field(static=True)
     feedthrough: bool = eqx.field(static=True)
@@ -108,7 +111,7 @@ class Fit(eqx.Module):
     moments: Moments | None = None
 
     @property
-    def innovation(self) -> Innovation | None:
+    def innovation(self) -> InnovationModel | None:
         """Noise model of a method with past outputs (PO-MOESP, N4SID, CVA); else `None`.
 
         Its `status` says whether the Riccati equation had a stabilising solution.
@@ -119,7 +122,11 @@ class Fit(eqx.Module):
 
     @property
     def innovation_gain(self) -> Float[Array, "nx ny"] | None:
-        """K of the innovation form, A − K C stable; `None` for PI-MOESP and ORSE."""
+        """K of the innovation form; `None` for PI-MOESP and ORSE.
+
+        A − K C is stable unless `innovation.status` is `no_stable_gain`: the Riccati equation has
+        no stabilising solution there, and K is zero.
+        """
         found = self.innovation
         return None if found is None else found.gain
 
@@ -135,7 +142,8 @@ class Fit(eqx.Module):
 
         D and the offset only where the method estimates them. For the given A and C (whose own
         errors are not in it), and simulation errors that are white and independent between
-        outputs: a lower bound where the noise is coloured.
+        outputs; for other noise it may be too small or too large. There
+        `lpvid.refine(...).robust_covariance` holds.
         """
         return self._linear()[1].shared
 
@@ -146,11 +154,12 @@ class Fit(eqx.Module):
         ny, nu = self.model.D.shape
         spread = jnp.sqrt(jnp.maximum(jnp.diagonal(found.shared), 0.0))
         n_b, n_d = self.order * nu, ny * nu if moments.feedthrough else 0
+        starts = found.x0 if moments.firsts is None else found.x0[moments.firsts]
         return StandardDeviations(
             B=spread[:n_b].reshape(nu, self.order).T,
             D=spread[n_b : n_b + n_d].reshape(ny, nu) if n_d else jnp.zeros((ny, nu)),
             output_offset=spread[n_b + n_d :] if moments.offset else jnp.zeros(ny),
-            x0=jnp.sqrt(jnp.maximum(jnp.diagonal(found.x0, axis1=1, axis2=2), 0.0)),
+            x0=jnp.sqrt(jnp.maximum(jnp.diagonal(starts, axis1=1, axis2=2), 0.0)),
         )
 
     def _linear(self) -> tuple[Moments, LinearCovariance]:
@@ -205,7 +214,7 @@ class Fit(eqx.Module):
 
 
 @jax.jit
-def _innovation(model: StateSpace, moments: Moments, residual_std: Array) -> Innovation:
+def _innovation(model: StateSpace, moments: Moments, residual_std: Array) -> InnovationModel:
     nu = model.B.shape[1]
     u_scale, y_scale = moments.scale[:nu], moments.scale[nu:]
     scaled = StateSpace(
@@ -218,7 +227,7 @@ def _innovation(model: StateSpace, moments: Moments, residual_std: Array) -> Inn
     assert moments.projections is not None
     simulated = (residual_std / y_scale) ** 2 * moments.dilution
     found = innovation(scaled, moments.projections, moments.columns, simulated)
-    return Innovation(
+    return InnovationModel(
         gain=found.gain / y_scale[None],
         covariance=found.covariance * y_scale[:, None] * y_scale[None],
         status=found.status,

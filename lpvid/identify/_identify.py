@@ -2,6 +2,7 @@
 
 import functools
 import math
+import operator
 import sys
 import warnings
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from jax.core import Tracer
 from lpvid._results import Status
 from lpvid.data import IOData
 from lpvid.identify._checks import (
+    above_rank,
     check_varying,
     describe_excitation,
     few_samples,
@@ -134,10 +136,10 @@ def identify(
     projection = projection_only(method)
     route: Route = "gram"
     found = source.range(projection, layout, route, rule is not None)
+    if not traced and throw:
+        source.check_varying()
     # Not `<`: a factorisation that broke down says NaN.
     if not traced and not float(found["smallest_pivot"]) > ILL_CONDITIONED:
-        if throw:
-            source.check_varying()
         route = "qr"
         found = source.range(projection, layout, route, rule is not None)
     lengths = source.lengths
@@ -145,7 +147,14 @@ def identify(
         order = method.order
         assert isinstance(order, int)
     else:
-        order = rule.choose(_evidence(found, layout, lengths))
+        order = operator.index(rule.choose(_evidence(found, layout, lengths)))
+        most = (layout.block_rows - 1) * layout.ny
+        if not 1 <= order <= most:
+            raise ValueError(
+                f"order={rule!r} chose {order}, but block_rows={layout.block_rows} carries 1 to "
+                f"{most} states with {layout.ny} outputs: let the rule keep to evidence.largest, "
+                f"or raise block_rows."
+            )
     complete = functools.partial(
         source.complete,
         found,
@@ -191,7 +200,8 @@ class _Records:
     def complete(self, found: dict[str, Any], rounding: float, **settings) -> dict[str, Any]:
         """B, D, offset and x0 for a given order."""
         needed = {name: found[name] for name in _NEEDED}
-        return complete_records(needed, self.data.u, self.data.y, rounding, **settings)
+        done = complete_records(needed, self.data.u, self.data.y, rounding, **settings)
+        return done | dict(samples=self.data.n_samples)
 
     def check_varying(self) -> None:
         """Raise for a constant channel."""
@@ -236,12 +246,14 @@ def _as_fit(
     both = found | result
     model = jax.tree.unflatten(_structure(dt), [result[name] for name in "ABCD"])
     shared = model.nx * layout.nu + layout.ny * (layout.nu * method.feedthrough + method.offset)
-    records = result["x0"].shape[0]
-    samples, unknowns = sum(lengths), (shared + model.nx * records) / layout.ny
+    # The state is unknown at the start of every window, not only of every record.
+    windows, samples = result["normal_matrix"].shape[0], result["samples"]
+    unknowns = (shared + model.nx * windows) / layout.ny
     moments = Moments(
         scale=found["scale"],
         projections=found["projections"],
         normal_matrix=result["normal_matrix"],
+        firsts=result.get("firsts"),
         columns=layout.columns(lengths),
         dilution=samples / max(samples - unknowns, 1.0),
         feedthrough=method.feedthrough,
@@ -282,8 +294,11 @@ def _free_unstable(
         firsts.append(len(windows))
         count = max(length // window, 1)
         windows += [window] * (count - 1) + [length - (count - 1) * window]
-    again = complete(windows=tuple(windows))
-    return again | dict(x0=again["x0"][np.array(firsts)], window=jnp.asarray(window))
+    # Too few samples for two windows in any record.
+    if len(windows) == len(lengths):
+        return result
+    again, starts = complete(windows=tuple(windows)), jnp.asarray(firsts)
+    return again | dict(x0=again["x0"][starts], firsts=starts, window=jnp.asarray(window))
 
 
 def _warn(
@@ -328,33 +343,19 @@ def _report(
             f"{remedies[-1]}.",
             stacklevel=3,
         )
-    elif fit.status == Status.ill_conditioned:
-        if int(fit.stats["excitation_rank"]) < layout.input_rows:
-            if throw:
-                raise ValueError(describe_excitation(source.data, layout, method.offset))
-            return
-        values = np.asarray(fit.singular_values)
-        rank = int(np.sum(values > rounding * values[0]))
-        warnings.warn(
-            f"order={fit.order} is above the numerical rank of the data ({rank}): the states "
-            f"beyond it are rounding noise. Use order={rank}, or data that excite more modes.",
-            stacklevel=3,
-        )
+        return
+    # What makes a fit poor comes first: it may be why the fit is not finite.
+    if int(fit.stats["excitation_rank"]) < layout.input_rows:
+        if throw:
+            raise ValueError(describe_excitation(source.data, layout, method.offset))
+        return
+    message = above_rank(fit.order, np.asarray(fit.singular_values), rounding)
+    if message is not None:
+        if throw and fit.status == Status.nonfinite:
+            raise ValueError(message)
+        warnings.warn(message, stacklevel=3)
     elif throw:
         raise ValueError(
             "The fit is not finite. Look for outliers, extreme channel scales or an order "
             f"({fit.order}) far above the system's; throw=False returns it as it is."
         )
-
-
-def _range(u, y, *, method, block_rows, lengths, route):
-    layout = Layout(block_rows, u.shape[1], y.shape[1], method.past_inputs, method.past_outputs)
-    return range_of_records(
-        u,
-        y,
-        method=projection_only(method),
-        layout=layout,
-        lengths=lengths,
-        route=route,
-        correlate=False,
-    )

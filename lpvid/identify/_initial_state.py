@@ -1,6 +1,7 @@
 """Initial states for a given model, and the fit they allow on data not seen."""
 
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lpvid.data import IOData
-from lpvid.identify._fit import Fit
 from lpvid.identify._linear_fit import solve_positive
 from lpvid.identify._simulation_error import record_equations
 from lpvid.models import LPVStateSpace, StateSpace
@@ -33,9 +33,7 @@ def _least_squares_start(A, B, C, D, equations):
 _equations = jax.jit(record_equations, static_argnames="lengths")
 
 
-def estimate_initial_state(
-    model: StateSpace | LPVStateSpace | Fit, data: IOData
-) -> Float[Array, "record nx"]:
+def estimate_initial_state(model: Any, data: IOData) -> Float[Array, "record nx"]:
     r"""Initial state of every record that minimises the model's simulation error.
 
     Least squares on $y(t) - \hat y(t; x_0 = 0) = C A^t x_0$, outputs weighted by their RMS; the
@@ -43,8 +41,9 @@ def estimate_initial_state(
     the record's length. Composes with `jit`, `vmap` and `grad`.
 
     Args:
-        model: discrete-time, with the data's sample time; an LPV model, for data with `kappa`; or a
-            `Fit`, whose output offset is then taken into account.
+        model: a `StateSpace` in discrete time with the data's sample time, or in continuous time
+            (inputs held); an LPV model, for data with `kappa`; or what a fit returns (`Fit`,
+            `Refined`, `StructuredModel`, ...), its output offset taken into account.
         data: one or several records.
 
     Returns:
@@ -64,7 +63,7 @@ def estimate_initial_state(
         >>> round(estimate_initial_state(model, data).item(), 6)
         3.0
     """
-    model, data = _without_offset(model, data)
+    model, data = _resolved(model, data)
     if isinstance(model, LPVStateSpace):
         return jnp.stack([_lpv_start(model, record) for record in data.records])
     _check_match(model, data)
@@ -75,7 +74,7 @@ def estimate_initial_state(
     return _least_squares_start(model.A, model.B, C, model.D / scale[:, None], equations)
 
 
-def simulation_fit(model: StateSpace | LPVStateSpace | Fit, data: IOData) -> Float[Array, " ny"]:
+def simulation_fit(model: Any, data: IOData) -> Float[Array, " ny"]:
     """Best fit (BFT) of each output, with every record's initial state estimated.
 
     100 max(1 - |y - ŷ| / |y - mean y|, 0) over all records together, the mean taken in each. This
@@ -101,7 +100,7 @@ def simulation_fit(model: StateSpace | LPVStateSpace | Fit, data: IOData) -> Flo
         >>> simulation_fit(StateSpace([[0.5]], [[1.0]], [[1.0]], dt=0.1), data).round(3).tolist()
         [100.0]
     """
-    model, data = _without_offset(model, data)
+    model, data = _resolved(model, data)
     starts = estimate_initial_state(model, data)
     missed = jnp.zeros(data.ny)
     moved = jnp.zeros(data.ny)
@@ -116,15 +115,22 @@ def simulation_fit(model: StateSpace | LPVStateSpace | Fit, data: IOData) -> Flo
     return 100.0 * jnp.maximum(1.0 - jnp.sqrt(missed / moved), 0.0)
 
 
-def _without_offset(
-    model: StateSpace | LPVStateSpace | Fit, data: IOData
-) -> tuple[StateSpace | LPVStateSpace, IOData]:
-    """The model itself, and the data it is for: a fit's offset taken out of the outputs."""
-    if not isinstance(model, Fit):
-        return model, data
-    if model.output_offset is None:
-        return model.model, data
-    return model.model, data.replace(y=data.y - model.output_offset[None])
+def _resolved(item: Any, data: IOData) -> tuple[StateSpace | LPVStateSpace, IOData]:
+    """The model itself at the data's sample time, and the data it is for."""
+    offset = getattr(item, "output_offset", None)
+    if offset is not None:
+        data = data.replace(y=data.y - offset[None])
+    model = item
+    for name in ("model", "state_space"):
+        model = getattr(model, name, model)
+    if isinstance(model, StateSpace) and not model.is_discrete:
+        model = model.discretise(data.dt)
+    if not isinstance(model, StateSpace | LPVStateSpace):
+        raise ValueError(
+            f"model: a {type(item).__name__} has no state-space model; give a StateSpace, an "
+            "LPVStateSpace, or the result of a fit to one."
+        )
+    return model, data
 
 
 def _lpv_start(model: LPVStateSpace, record: IOData) -> Float[Array, " nx"]:

@@ -14,11 +14,12 @@ from lpvid.models import StateSpace
 _LEAST_NOISE = 1e-14
 
 
-class Innovation(eqx.Module):
+class InnovationModel(eqx.Module):
     r"""Noise model in innovation form, $x_+ = A x + B u + K e$, $y = C x + D u + e$.
 
     Attributes:
-        gain: K, with A − K C stable; zero where no gain is better than none.
+        gain: K; A − K C is stable unless `status` is `no_stable_gain`. Zero there, where the
+            Riccati equation has no stabilising solution, and where no gain is better than none.
         covariance: of the innovations e, one step ahead.
         status: `successful`, or `no_stable_gain`.
 
@@ -59,7 +60,7 @@ class Projections(eqx.Module):
 
 def innovation(
     model: StateSpace, data: Projections, columns: int, simulated: Float[Array, " ny"]
-) -> Innovation:
+) -> InnovationModel:
     """K from the state sequences of two successive projections (Van Overschee and De Moor 1996).
 
     Projected on past and future inputs, past outputs (and, one sample later, the present ones),
@@ -116,7 +117,7 @@ def innovation(
     useless = (spectral_radius(A) < 1.0) & (jnp.sum(simulated) <= jnp.trace(covariance))
     ratio = jnp.sqrt(simulated / jnp.diagonal(R))
     covariance = jnp.where(sound, covariance, R)
-    return Innovation(
+    return InnovationModel(
         gain=jnp.where(sound & ~useless, gain, 0.0),
         covariance=jnp.where(useless, R * ratio[:, None] * ratio[None], covariance),
         status=Status.where(sound | useless, Status.successful, Status.no_stable_gain),

@@ -3,16 +3,23 @@
 import abc
 import dataclasses
 import functools
-from typing import ClassVar, Literal
+import operator
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from lpvid.identify._factor import DataFactor, solve_lower
 from lpvid.identify._order import AbstractOrderRule, NoiseFloor, Threshold
 
 Order = int | Literal["auto"] | AbstractOrderRule
+
+
+def plain(value: Any) -> Any:
+    """NumPy's whole numbers as Python's."""
+    return operator.index(value) if isinstance(value, np.integer) else value
 
 
 class AbstractSubspaceMethod(eqx.Module):
@@ -55,8 +62,8 @@ class AbstractSubspaceMethod(eqx.Module):
         0.8
     """
 
-    order: Order = eqx.field(static=True, default="auto")
-    block_rows: int | None = eqx.field(static=True, default=None)
+    order: Order = eqx.field(static=True, default="auto", converter=plain)
+    block_rows: int | None = eqx.field(static=True, default=None, converter=plain)
     feedthrough: bool = eqx.field(static=True, default=True, kw_only=True)
     stabilise: float | Literal[False] = eqx.field(static=True, default=False, kw_only=True)
     offset: bool = eqx.field(static=True, default=False, kw_only=True)

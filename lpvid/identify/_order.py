@@ -93,7 +93,7 @@ class NoiseFloor(AbstractOrderRule):
 class InformationCriterion(AbstractOrderRule):
     r"""Bauer's singular value criterion SVC on the canonical correlations.
 
-    Minimises $\rho_{n+1}^2 + 2 n (2 n_y + n_u) \log(M) / (2 M)$ over n (Bauer 2001, "Order
+    Minimises $\rho_{n+1}^2 + n (2 n_y + n_u) \log(M) / M$ over n (Bauer 2001, "Order
     estimation for subspace methods", Automatica 37): the first correlation left out against the
     price of the parameters.
 
@@ -130,7 +130,10 @@ class LargestGap(AbstractOrderRule):
 
     def choose(self, evidence: Evidence) -> int:
         """Compare every singular value with the next."""
-        return choose_order(evidence.singular_values, evidence.largest)
+        values = evidence.singular_values
+        floored = np.maximum(values, _FLOOR * values[0])
+        largest = min(evidence.largest, floored.shape[0] - 1)
+        return int(np.argmax(floored[:largest] / floored[1 : largest + 1])) + 1
 
 
 class Threshold(AbstractOrderRule):
@@ -160,10 +163,3 @@ def _correlations(evidence: Evidence, rule: str) -> Float[np.ndarray, " row"]:
             f"order=Threshold() or LargestGap(), or a method such as PastOutputMOESP."
         )
     return evidence.correlations
-
-
-def choose_order(singular_values: Float[np.ndarray, " row"], largest: int) -> int:
-    """Order after which the singular values fall most, as a ratio, up to `largest`."""
-    floored = np.maximum(singular_values, _FLOOR * singular_values[0])
-    largest = min(largest, floored.shape[0] - 1)
-    return int(np.argmax(floored[:largest] / floored[1 : largest + 1])) + 1

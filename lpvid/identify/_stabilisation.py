@@ -115,9 +115,9 @@ def stabilisation(
         )
     layout = Layout(block_rows, data.nu, data.ny, method.past_inputs, method.past_outputs)
     require_samples(layout, data.lengths)
+    check_varying(data)
     found = _range(data, method, layout, "gram")
     if not float(found["smallest_pivot"]) > ILL_CONDITIONED:
-        check_varying(data)
         found = _range(data, method, layout, "qr")
     values = np.asarray(found["singular_values"])
     observability = np.asarray(found["vectors"])[:, : wanted[-1]] * np.sqrt(values[: wanted[-1]])

@@ -7,7 +7,15 @@ import pytest
 from scipy.signal import butter, lfilter
 
 from lpvid.data import IOData, join
-from lpvid.identify import PastOutputMOESP, identify
+from lpvid.identify import (
+    AbstractOrderRule,
+    Chunks,
+    ContinuousTimeMOESP,
+    PastInputMOESP,
+    PastOutputMOESP,
+    identify,
+    stabilisation,
+)
 
 from .helpers import common_problem, respond, three_modes
 
@@ -83,6 +91,56 @@ def test_inputs_that_only_just_excite(record, spoil, message):
     data = IOData(u=u, y=y, dt=DT, names={"u": ("push", "pull")})
     with pytest.warns(UserWarning, match=message):
         identify(data, PastOutputMOESP(order=6, block_rows=8))
+
+
+@pytest.mark.parametrize(
+    "identified",
+    [
+        lambda data: identify(data, PastInputMOESP(order=2, block_rows=8)),
+        lambda data: identify(Chunks(lambda: [data]), PastInputMOESP(order=2, block_rows=8)),
+        lambda data: identify(data, ContinuousTimeMOESP(order=2, tau=0.1, block_rows=3)),
+        lambda data: stabilisation(data, PastInputMOESP(block_rows=8), orders=[2]),
+    ],
+)
+def test_constant_outputs_are_named_by_every_method(record, identified):
+    u, y = record
+    data = IOData(u=u, y=np.column_stack([y[:, 0], 0.0 * y[:, 1] + 2.0]), dt=DT)
+    with pytest.raises(ValueError, match=r"Output 'y2' is constant.*data.select\(outputs"):
+        identified(data)
+
+
+def test_an_order_above_the_rank_without_past_outputs(record):
+    """One state, no noise: past it singular values are rounding, whatever becomes of the model."""
+    u = record[0][:, :1]
+    y = lfilter([1.0], [1.0, -0.8], u, axis=0)
+    data = IOData(u=u, y=y, dt=DT)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            identify(data, PastInputMOESP(order=8, block_rows=10))
+            said = " ".join(str(warning.message) for warning in caught)
+        except ValueError as error:
+            said = str(error)
+    assert "order=8 is above the numerical rank of the data (1)" in said
+
+
+def test_whole_numbers_of_numpy_are_taken(record):
+    data = IOData(u=record[0], y=record[1], dt=DT)
+    method = PastOutputMOESP(order=np.int64(6), block_rows=np.int32(8))
+    assert method == PastOutputMOESP(order=6, block_rows=8)
+    assert type(identify(data, method).order) is int
+    assert ContinuousTimeMOESP(order=np.int64(2)).order == 2
+
+
+@pytest.mark.parametrize("order", [0, 15])
+def test_a_rule_of_ones_own_keeps_to_what_the_rows_carry(record, order):
+    class Fixed(AbstractOrderRule):
+        def choose(self, evidence):
+            return order
+
+    data = IOData(u=record[0], y=record[1], dt=DT)
+    with pytest.raises(ValueError, match=f"chose {order}, but block_rows=8 carries 1 to 14"):
+        identify(data, PastOutputMOESP(order=Fixed(), block_rows=8))
 
 
 def test_good_data_bring_no_warning(record):

@@ -10,7 +10,7 @@ from lpvid._results import Status
 from lpvid.data import IOData
 from lpvid.identify import Chunks, PastOutputMOESP, _chunks, identify
 
-from .helpers import common_problem, sorted_poles
+from .helpers import common_problem, respond, sorted_poles
 
 DT = 1 / 50
 METHOD = PastOutputMOESP(order=6, block_rows=8, offset=True)
@@ -75,6 +75,7 @@ def test_at_most_two_chunks_exist_at_a_time():
     assert most <= 3  # the one for the channel names, the one at work, the one being read
 
 
+@pytest.mark.slow
 def test_arrays_on_disk(tmp_path):
     u, _, y = common_problem(1301)
     for name, signal in (("u", u), ("y", y)):
@@ -116,6 +117,27 @@ def test_constant_channels_are_found_over_all_chunks():
     still = np.column_stack([u[:, 0], np.full(1300, 3.0)])
     with pytest.raises(ValueError, match="Input 'u2' is constant"):
         identify(chunked(still, y, [600]), METHOD)
+
+
+def test_weak_excitation_is_judged_on_more_than_a_short_first_chunk():
+    u, _, y = common_problem(1300)
+    sine = np.column_stack([u[:, 0], np.sin(0.3 * np.arange(1300))])
+    with pytest.raises(ValueError, match="Input 'u2' excites 2 of the 16"):
+        identify(chunked(sine, y, [2, 30, 700]), METHOD)
+
+
+def test_an_unstable_window_longer_than_a_piece():
+    """The residual is that of the samples used: one piece of 512, not a window of 694."""
+    rng = np.random.default_rng(4)
+    u, noise = rng.standard_normal((2, 1400, 1))
+    y = respond(([[1.01]], [[1.0]], [[1.0]], [[0.0]]), u) + 0.5 * noise
+    with pytest.warns(UserWarning, match="unstable"):
+        fit = identify(chunked(u, y, [600]), PastOutputMOESP(order=1, block_rows=8))
+    model = (fit.model.A, fit.model.B, fit.model.C, fit.model.D)
+    missed = y[:512] - respond(model, u[:512], fit.x0[0])
+    rms = np.sqrt(np.mean(missed**2))
+    np.testing.assert_allclose(fit.stats["residual_std"], rms, rtol=1e-4)
+    assert fit.moments.dilution == pytest.approx(512 / (512 - 3))
 
 
 @pytest.mark.slow

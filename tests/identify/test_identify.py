@@ -189,13 +189,29 @@ def unstable_data(n=400):
 
 
 def test_unstable_systems_are_reported_and_still_right():
-    system, data = unstable_data()
+    system, data = unstable_data(1150)
+    # The second record is too short for two windows of log(1000)/log(1.02) = 348 samples.
+    ends = (slice(0, 750), slice(750, 1150))
+    u = [np.asarray(data.u[part]) for part in ends]
+    data = IOData(u=u, y=[respond(system, part) for part in u], dt=0.1)
     with pytest.warns(UserWarning, match="stabilise=0.9999"):
         fit = identify(data, PastOutputMOESP(order=2, block_rows=5))
     assert fit.status == Status.unstable
-    assert int(fit.stats["window"]) > 0
+    assert int(fit.stats["window"]) == 348
+    assert fit.moments.firsts.tolist() == [0, 2]
+    assert fit.x0.shape == fit.standard_deviations.x0.shape == (2, 2)
+    # B, D and the states at the start of three windows.
+    assert fit.moments.dilution == pytest.approx(1150 / (1150 - 9))
     np.testing.assert_allclose(fit.stats["spectral_radius"], 1.02, rtol=1e-6)
     np.testing.assert_allclose(markov(matrices(fit.model), 8), markov(system, 8), rtol=1e-4)
+
+
+def test_the_state_is_not_freed_where_one_window_holds_the_record():
+    _, data = unstable_data()
+    with pytest.warns(UserWarning, match="unstable"):
+        fit = identify(data, PastOutputMOESP(order=2, block_rows=5))
+    assert int(fit.stats["window"]) == 0
+    assert fit.moments.firsts is None
 
 
 def test_stabilised_models_are_stable():

@@ -173,6 +173,7 @@ def test_orse_is_the_published_matrix():
     np.testing.assert_allclose(root @ root.T, published, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_no_gain_where_none_is_better_than_none():
     """White output noise on light damping: 20 past samples are too few for a filter."""
     u, clean, y = common_problem(3000)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from lpvid.data import IOData
 from lpvid.identify import PastOutputMOESP, identify, simulation_fit
@@ -33,6 +34,7 @@ def test_offsets_come_out_without_a_spurious_state():
     np.testing.assert_allclose(markov(found, 20), markov(system, 20), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_centred_short_records_keep_their_order():
     u, clean, y = common_problem(400, seed=5)
     # The mean of the record is not that of the noise-free response to inputs without mean.

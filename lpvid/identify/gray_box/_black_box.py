@@ -12,10 +12,12 @@ from jaxtyping import Array, Float, Int
 
 from lpvid._results import Status
 from lpvid.data import IOData
+from lpvid.identify._checks import above_rank, few_samples
 from lpvid.identify._order import Evidence, LargestGap
 from lpvid.identify.gray_box._candidates import black_boxes
 from lpvid.identify.gray_box._methods import AbstractContinuousTimeMethod, ContinuousTimeMOESP
 from lpvid.identify.gray_box._search import (
+    NEGLIGIBLE,
     UNEXCITED,
     FilterSearch,
     best,
@@ -39,7 +41,7 @@ class ContinuousTimeFit(eqx.Module):
         model: the continuous-time model.
         x0: initial state of every record, (record, nx).
         order: number of states.
-        fit: simulation fit to the identification data, percent for each output, (ny,).
+        fit: simulation fit (BFT) to the identification data, percent for each output, (ny,).
         tau: time constant of the filters that were kept, s.
         block_rows: number of rows that was kept.
         search: every filter that was tried.
@@ -98,7 +100,8 @@ def identify_continuous(
             channels, inputs that excite too little.
 
     Warns:
-        UserWarning: the model is unstable.
+        UserWarning: the model is unstable, the order is above the rank of the data, or samples are
+            few for the order.
 
     Example:
         >>> import numpy as np
@@ -157,7 +160,7 @@ def identify_continuous(
         singular_values = singular_values[: int(values["block_rows"]) * data.ny]
     fit = ContinuousTimeFit(**values, order=order, singular_values=singular_values)
     if not traced:
-        _report(fit, throw)
+        _report(fit, data, throw)
     return fit
 
 
@@ -169,6 +172,7 @@ def _chosen(candidates, found, y, input_scale, output_scale, taus, *, dt, rows, 
     filters = describe_filters(found, index, taus.shape[0])
     chosen = jax.tree.map(lambda leaf: leaf[index], candidates)
     A = chosen["A"]
+    order = A.shape[0]
     model = StateSpace(
         A=A / dt,
         B=chosen["B"] / dt / input_scale[None, :],
@@ -178,7 +182,9 @@ def _chosen(candidates, found, y, input_scale, output_scale, taus, *, dt, rows, 
     growth = jnp.max(jnp.linalg.eigvals(A).real)
     unstable = growth * max(lengths) > _GROWTH
     status = Status.where(unstable, Status.unstable, Status.successful)
-    status = Status.where(filters.pivot > UNEXCITED, status, Status.ill_conditioned)
+    values = filters.singular_values
+    poor = ~(filters.pivot > UNEXCITED) | (values[order - 1] <= NEGLIGIBLE * values[0])
+    status = Status.where(poor, Status.ill_conditioned, status)
     status = Status.where(jnp.isfinite(jnp.sum(chosen["residual"])), status, Status.nonfinite)
     return dict(
         model=model,
@@ -214,8 +220,16 @@ def _order(found: tuple, rows: tuple[int, ...], data: IOData) -> int:
     return LargestGap().choose(evidence)
 
 
-def _report(fit: ContinuousTimeFit, throw: bool) -> None:
+def _report(fit: ContinuousTimeFit, data: IOData, throw: bool) -> None:
     """Raise or warn, with the remedy."""
+    # `identify` calls for the user: one frame more.
+    level = 4
+    for message in (
+        few_samples(fit.order, data.nu, data.ny, data.n_samples),
+        above_rank(fit.order, np.asarray(fit.singular_values), NEGLIGIBLE),
+    ):
+        if message is not None:
+            warnings.warn(message, stacklevel=level)
     if fit.status == Status.nonfinite:
         if throw:
             raise ValueError(
@@ -228,5 +242,5 @@ def _report(fit: ContinuousTimeFit, throw: bool) -> None:
         warnings.warn(
             f"The identified model is unstable (a pole {growth:.4g} rad/s to the right of the "
             f"imaginary axis). Lower the order ({fit.order}), or try other tau and block_rows.",
-            stacklevel=3,
+            stacklevel=level,
         )

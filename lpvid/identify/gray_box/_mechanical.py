@@ -6,15 +6,18 @@ import warnings
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from lpvid._results import Status
 from lpvid.data import IOData
+from lpvid.identify._checks import above_rank, few_samples
 from lpvid.identify.gray_box._candidates import mechanical
 from lpvid.identify.gray_box._cone import nearest_semidefinite
 from lpvid.identify.gray_box._methods import AbstractContinuousTimeMethod, ContinuousTimeMOESP
 from lpvid.identify.gray_box._search import (
+    NEGLIGIBLE,
     UNEXCITED,
     FilterSearch,
     best,
@@ -42,7 +45,7 @@ class MechanicalFit(eqx.Module):
         stiffness: K (n, n), symmetric positive definite, input / output.
         model: the same in continuous time, states [y, ẏ].
         x0: initial state of every record, (record, 2 n).
-        fit: simulation fit to the identification data, percent for each output, (n,).
+        fit: simulation fit (BFT) to the identification data, percent for each output, (n,).
         tau: time constant of the filters that were kept, s.
         block_rows: number of rows that was kept.
         search: every filter that was tried.
@@ -138,7 +141,8 @@ def identify_mechanical(
             samples, τ out of range, constant channels, inputs that excite too little.
 
     Warns:
-        UserWarning: a matrix had to be made (semi)definite.
+        UserWarning: a matrix had to be made (semi)definite, the order is above the data's rank,
+            or samples are few.
 
     Source: 000, section II.
 
@@ -214,7 +218,9 @@ def _chosen(candidates, found, y, input_scale, output_scale, taus, *, dt, rows, 
     finite = jnp.isfinite(jnp.sum(chosen["residual"])) & jnp.isfinite(jnp.sum(mass + stiffness))
     pivot = filters.pivot
     status = Status.where(indefinite, Status.indefinite, Status.successful)
-    status = Status.where(pivot > UNEXCITED, status, Status.ill_conditioned)
+    values, order = filters.singular_values, 2 * mass.shape[0]
+    poor = ~(pivot > UNEXCITED) | (values[order - 1] <= NEGLIGIBLE * values[0])
+    status = Status.where(poor, Status.ill_conditioned, status)
     status = Status.where(finite, status, Status.nonfinite)
     position = output_scale[None, :]
     return dict(
@@ -268,6 +274,13 @@ def _check_degrees(method, data):
 
 def _report(fit: MechanicalFit, data: IOData, throw: bool) -> None:
     """Raise or warn, with the remedy."""
+    order = fit.model.nx
+    for message in (
+        few_samples(order, data.nu, data.ny, data.n_samples),
+        above_rank(order, np.asarray(fit.singular_values), NEGLIGIBLE),
+    ):
+        if message is not None:
+            warnings.warn(message, stacklevel=3)
     if fit.status == Status.nonfinite:
         if throw:
             raise ValueError(

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lpvid.identify._factor import solve_lower
+from lpvid.identify._methods import plain
 from lpvid.identify.gray_box._filters import AbstractFilterBasis, LaguerreFilters
 
 Order = int | Literal["auto"]
@@ -71,7 +72,7 @@ class AbstractContinuousTimeMethod(eqx.Module):
         (0.15,)
     """
 
-    order: Order = eqx.field(static=True, default="auto")
+    order: Order = eqx.field(static=True, default="auto", converter=plain)
     tau: tuple[float, ...] | None = eqx.field(static=True, default=None, converter=_several)
     block_rows: tuple[int, ...] | None = eqx.field(static=True, default=None, converter=_several)
     feedthrough: bool = eqx.field(static=True, default=False)

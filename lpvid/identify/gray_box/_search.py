@@ -20,6 +20,8 @@ _TAU_COUNT = 8
 _BLOCK_ROWS = (4, 6, 10)
 # What rounding of the Gram matrix leaves of a row that others explain.
 UNEXCITED = 1e-12
+# Share of the largest singular value that rounding of the Gram matrix may leave.
+NEGLIGIBLE = 1e-6
 
 
 class FilterSearch(eqx.Module):
@@ -28,8 +30,8 @@ class FilterSearch(eqx.Module):
     Attributes:
         tau: time constants in s, (candidate,).
         block_rows: numbers of rows, (candidate,).
-        fit: simulation fit to the identification data in percent, (candidate, ny); NaN where the
-            candidate has no finite response.
+        fit: simulation fit (BFT) to the identification data in percent, (candidate, ny); NaN where
+            the candidate has no finite response.
     """
 
     tau: Float[Array, " candidate"]
@@ -129,14 +131,14 @@ def _samples_needed(block_rows: int, data: IOData) -> int:
 
 
 def check_excitation(data: IOData, found: tuple, block_rows: int) -> None:
-    """Look whether the inputs moved enough at some filter.
+    """Look whether every channel moved, and the inputs enough at some filter.
 
     Raises:
         ValueError: naming a constant channel, or saying that the inputs do not move independently.
     """
+    check_varying(data)
     if max(np.max(np.asarray(pivots)) for _, _, pivots in found) > UNEXCITED:
         return
-    check_varying(data)
     names = ", ".join(data.input_names)
     raise ValueError(
         f"The inputs {names} excite too little for block_rows={block_rows}: after filtering one is "
@@ -178,7 +180,7 @@ def search_table(
     y: Float[Array, "time ny"],
     lengths: tuple[int, ...],
 ) -> FilterSearch:
-    """Normalised fit of each candidate in percent, from sums of squared errors.
+    """Normalised fit of each candidate in percent, at least 0, from sums of squared errors.
 
     Candidates are ordered by number of rows, then by τ.
     """
@@ -190,7 +192,7 @@ def search_table(
     return FilterSearch(
         tau=jnp.tile(taus, len(rows)),
         block_rows=jnp.repeat(jnp.asarray(rows), taus.shape[0]),
-        fit=100.0 * (1.0 - jnp.sqrt(residual / moved[None, :])),
+        fit=100.0 * jnp.maximum(1.0 - jnp.sqrt(residual / moved[None, :]), 0.0),
     )
 
 

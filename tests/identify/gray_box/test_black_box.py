@@ -49,6 +49,20 @@ def test_order_from_the_gap(data):
     assert identify(data, method).order == 4
 
 
+def test_few_samples_and_an_order_above_the_rank_are_said():
+    """No noise, one state: the second is rounding."""
+    u = np.repeat(np.random.default_rng(0).standard_normal((10, 1)), 4, axis=0)
+    plant = StateSpace([[-2.0]], [[1.0]], [[1.0]])
+    record = IOData(u=u, y=plant.simulate(u=u, dt=DT), dt=DT)
+    method = ContinuousTimeMOESP(order=2, tau=0.15, block_rows=3)
+    with pytest.warns(UserWarning) as caught:
+        fit = identify(record, method, throw=False)
+    said = [str(warning.message) for warning in caught]
+    assert any("40 samples are few for order=2" in text for text in said)
+    assert any("order=2 is above the numerical rank of the data (1)" in text for text in said)
+    assert fit.status == Status.ill_conditioned
+
+
 def test_order_is_needed_under_jit(data):
     method = ContinuousTimeMOESP(tau=0.15, block_rows=6)
     with pytest.raises(ValueError, match='order="auto"'):

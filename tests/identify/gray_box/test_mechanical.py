@@ -86,6 +86,7 @@ def test_published_filters_agree_where_they_are_well_conditioned(clean):
     assert np.all(errors(identify_mechanical(clean, method)) < 0.02)
 
 
+@pytest.mark.slow
 def test_records_may_start_in_motion(clean_fit):
     starts = [jnp.array([0.01, -0.01, 0.05, 0.02]), jnp.array([-0.01, 0.0, 0.0, 0.1])]
     parts = [record(seed, n=N // 2, x0=x0) for seed, x0 in enumerate(starts)]
