@@ -45,7 +45,8 @@ def recognise(model: Any, data: IOData, predictor: AbstractPredictor) -> Start:
         if gain is None and estimates_gain:
             gain = model.innovation_gain
         # Said by the fit, so that it is known under jit too.
-        feedthrough = model.moments.feedthrough if isinstance(model, Fit) else None
+        moments = model.moments if isinstance(model, Fit) else None
+        feedthrough = None if moments is None else moments.feedthrough
         model = model.model
     if isinstance(model, MechanicalFit):
         model = StructuredModel(model.structure, model.parameters)
