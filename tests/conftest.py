@@ -33,3 +33,8 @@ def measured_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"measured data not found in {folder}; set LPVID_DATA to its folder")
     return folder
+
+
+def pytest_collection_modifyitems(items):
+    """The longest file first: whole files go to one process each, and none is left to wait."""
+    items.sort(key=lambda item: item.path.name != "test_examples.py")

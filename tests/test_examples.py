@@ -19,9 +19,16 @@ FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 # Modules whose examples take more than 5 s altogether, nearly all of it compilation.
 SLOW = {
     "lpvid._solve",
+    "lpvid.analysis._uncertainty",
+    "lpvid.identify._methods",
+    "lpvid.identify.gray_box._black_box",
+    "lpvid.identify.gray_box._mechanical",
+    "lpvid.mechanics._single_link_arm",
     "lpvid.mechanics._study_records",
     "lpvid.mechanics._two_link_arm",
     "lpvid.plot._search",
+    "lpvid.refinement._profile",
+    "lpvid.refinement._refine",
     "lpvid.restructure._restructure",
 }
 MODULES = sorted(module.name for module in pkgutil.walk_packages(lpvid.__path__, "lpvid."))

@@ -61,6 +61,7 @@ def test_unstable_matrices_give_nan():
     assert np.all(np.isnan(_linalg.continuous_lyapunov(unstable - 0.7 * jnp.eye(2), Q)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solve", [_linalg.discrete_lyapunov, _linalg.continuous_lyapunov])
 def test_lyapunov_derivatives(solve):
     rng = np.random.default_rng(1)

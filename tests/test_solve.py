@@ -49,6 +49,7 @@ def test_a_point_close_to_its_only_bound_stays():
     np.testing.assert_allclose(bounds.bounded(bounds.free(jnp.array([1e-12]))), 1e-12, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_bounds_have_the_right_gradients():
     start = jnp.array([0.3, -1.0, 0.5, 1.2, 0.0])
     check_grads(lambda x: BOUNDS.bounded(jnp.asarray(x)), (start,), order=1, rtol=1e-6)

@@ -24,7 +24,6 @@ from lpvid.commands._records import (
     read_records,
     subspace_method,
     without_offsets,
-    without_rest,
 )
 from lpvid.data import IOData, Offset, join
 from lpvid.identify import Fit, identify, simulation_fit
@@ -253,8 +252,6 @@ def _identify(
         fit = identify(data, subspace_method(arguments))
     except ValueError as error:
         raise UsageError(f"at K = {written(kappa)}: {error}") from error
-    if offset is not None and fit.output_offset is not None:
-        data, offset = without_rest(data, offset, fit.output_offset)
     # Of an ill-conditioned fit, `identify` says only that.
     if not bool(fit.model.is_stable()) and not bool(fit.status == Status.unstable):
         warnings.add("the model is not stable; ask for --stabilise, or another --order")

@@ -121,6 +121,7 @@ def norm_of(matrices, dt):
 reverse = jax.jit(jax.value_and_grad(norm_of), static_argnums=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.0, 0.02])
 def test_gradient_against_differences(dt):
     system = modal_system(np.random.default_rng(6), 6, 2, 2, damping=1e-2, feedthrough=0.3)

@@ -9,6 +9,7 @@ from lpvid.models import StateSpace
 peaks = eqx.filter_jit(peak_frequencies)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.0, pytest.param(0.01, marks=pytest.mark.slow)])
 def test_peaks_are_the_local_maxima_of_a_dense_grid(dt):
     A, B, C, D = modal_system(np.random.default_rng(1), 8, 2, 2, damping=3e-3, feedthrough=0.1)

@@ -66,6 +66,7 @@ def test_several_files_are_several_records(capsys, tmp_path):
     assert len(content["offsets"]["u"]) == 2
 
 
+@pytest.mark.slow
 def test_an_unstable_model_is_warned_of_and_can_be_stabilised(capsys, tmp_path):
     u, _ = simulate(np.zeros(400), 3)
     y = np.zeros(400)
@@ -90,6 +91,7 @@ def test_an_unstable_model_is_warned_of_and_can_be_stabilised(capsys, tmp_path):
     assert captured.err == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "argv", "least"),
     [

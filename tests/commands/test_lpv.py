@@ -12,6 +12,9 @@ from lpvid.models import LPVStateSpace
 from . import record_files
 from .record_files import frequencies, write_table
 
+# Each run compiles a search of its own; its parts have their own quick tests.
+pytestmark = pytest.mark.slow
+
 COLUMNS = ["--input", "u", "--output", "y", "--time", "t", "--order", "4", "--starts", "2"]
 
 

@@ -141,6 +141,7 @@ def poles_and_gain(y, data):
     return jnp.trace(fit.model.A), fit.model.dc_gain(), fit.status == Status.successful
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [jax.lax.map, pytest.param(jax.vmap, marks=pytest.mark.slow)])
 def test_runs_in_batches(common, batch):
     data = common[0][:600]
@@ -188,6 +189,7 @@ def unstable_data(n=400):
     return system, IOData(u=u, y=respond(system, u), dt=0.1)
 
 
+@pytest.mark.slow
 def test_unstable_systems_are_reported_and_still_right():
     system, data = unstable_data(1150)
     # The second record is too short for two windows of log(1000)/log(1.02) = 348 samples.
@@ -315,6 +317,7 @@ def test_mismatched_models_are_refused(common):
         simulation_fit(StateSpace(np.eye(1), np.ones((1, 1)), np.ones((2, 1)), dt=DT), common[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exchanged", [False, True])
 def test_measured_arm_beats_slicot_on_the_unseen_half(measured_data, exchanged):
     table = np.loadtxt(measured_data / "daisy" / "CD_player_arm.dat")

@@ -16,6 +16,9 @@ from lpvid.mechanics import (
     simulate_single_link,
 )
 
+# Every experiment compiles a closed loop; `test_single_link_simulation` runs the same arm.
+pytestmark = pytest.mark.slow
+
 ARM = reference_single_link_arm()
 KEY = jax.random.key(5)
 STICKY = ArmEffects(friction=DryFriction(0.4))

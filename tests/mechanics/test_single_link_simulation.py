@@ -75,6 +75,7 @@ def test_sliding_friction_is_a_constant_current():
     np.testing.assert_allclose(rough.positions, smooth.positions, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_friction_against_a_stiff_solver():
     """A steep smooth law under an implicit variable-step solver, as independent as it gets."""
     steep, friction = 1e-4, DryFriction(0.4, breakaway=0.6, stribeck_speed=0.3)

@@ -106,6 +106,7 @@ def test_jit_and_vmap_leave_the_result_alone():
     np.testing.assert_allclose(frozen.A[1], LPV.at(0.5).A, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences():
     @jax.jit
     def loss(coefficients, x0, kappa):

@@ -79,6 +79,7 @@ def test_a_single_input_may_be_flat():
     np.testing.assert_array_equal(system.simulate(u=u), system.simulate(u=u[:, None]))
 
 
+@pytest.mark.slow
 def test_gradients_forward_and_reverse():
     system = flexible(modes=1).discretise(DT)
     rng = np.random.default_rng(3)

@@ -319,6 +319,7 @@ def test_impossible_methods_are_refused(options):
 # --- what the status says, and families of models
 
 
+@pytest.mark.slow
 def test_a_useless_match_and_an_unstable_black_box_are_not_called_successful():
     unstable = StateSpace([[0.0, 4.0], [-4.0, 0.04]], [[0.0], [1.0]], [[4.0, 0.0]])
     best = restructure(unstable, ONE_MODE, starts=8, key=KEY, method=MATCH_ONLY)
@@ -345,6 +346,7 @@ def test_modes_that_cross_keep_their_places():
         np.testing.assert_allclose(found.parameters, exact(kappa), rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_number_of_a_failing_black_box_is_said():
     broken = StateSpace(TWO_MODES.A * np.nan, TWO_MODES.B, TWO_MODES.C)
     with pytest.raises(ValueError, match=r"black_boxes\[1\]: black_box"):

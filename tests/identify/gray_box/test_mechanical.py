@@ -20,6 +20,9 @@ from lpvid.identify.gray_box import FilterPowers
 from lpvid.identify.gray_box._search import bandwidth
 from lpvid.mechanics import MassSpringDamper, random_steps
 
+# The search compiles for every number of rows; `test_black_box` runs the same filters quickly.
+pytestmark = pytest.mark.slow
+
 PLANT = MassSpringDamper.reference()
 N, DT = 3000, 0.02
 FIXED: dict[str, Any] = dict(tau=0.15, block_rows=6)
