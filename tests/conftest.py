@@ -1,5 +1,6 @@
 """Shapes and dtypes enforced, float64 everywhere, measured data found or skipped."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -24,6 +25,21 @@ ROOT = Path(__file__).resolve().parents[1]
 # Compilation is most of the suite's time: what took long to compile is kept for the next run.
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+# Linux lets a process have 65530 memory maps; every compiled function takes several, and LLVM
+# aborts the process when there are no more.
+MOST_MAPS = 15_000
+MAPS = Path("/proc/self/maps")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def bounded_compiled_code():
+    """Forget compiled functions between files before they fill the process's memory maps."""
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
