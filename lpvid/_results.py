@@ -26,8 +26,12 @@ class Status(eqx.Enumeration):
         "block rows are too large for this record: excite every input, or lower them."
     )
     unstable = (
-        "The estimated model is unstable. Ask for stabilisation, lower the order, or use "
-        "past outputs as instruments."
+        "The estimated model is unstable. Lower the order, raise the block rows, or ask for "
+        "stabilisation where the method has it."
+    )
+    constant_channel = (
+        "A channel is constant, so nothing can be learned from it. Excite the input, check the "
+        "output's sensor, or leave the channel out with data.select."
     )
     no_stable_gain = (
         "The Riccati equation of the innovation gain has no stabilising solution, so the gain is "
@@ -36,6 +40,10 @@ class Status(eqx.Enumeration):
     poor_match = (
         "The structured model is no closer to the black box than no model at all. Give more or "
         "better starts, another structure, or a black box that is stable."
+    )
+    uncertified = (
+        "The norm may still fall: no certificate of a minimum was found within the steps. Raise "
+        "HinfMatching(bundle_steps=...) or its tolerance, or give a better start."
     )
     at_bound = (
         "A parameter ended at its bound; its uncertainty is not given, that of the others holds "
@@ -48,6 +56,10 @@ class Status(eqx.Enumeration):
     overflow = (
         "The simulation grows without bound from this start. Give a stable start, shorter records, "
         "Innovation() with a gain that makes the predictor stable, or OutputError(shooting=...)."
+    )
+    discontinuous = (
+        "The pieces of the shooting search do not meet, so no simulation of a whole record stands "
+        "behind the fit. Raise max_steps, choose longer or shorter pieces, or give a better start."
     )
     indefinite = (
         "The records alone give an indefinite mass, damping or stiffness matrix; the nearest "

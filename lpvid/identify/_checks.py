@@ -1,8 +1,11 @@
 """Faults of data and settings, named with their remedy."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 
 from lpvid.data import IOData
+from lpvid.identify._engine import STILL
 from lpvid.identify._factor import RANK_TOLERANCE, Layout, Route
 from lpvid.identify._gram import hankel_factor
 from lpvid.identify._methods import AbstractSubspaceMethod
@@ -10,6 +13,10 @@ from lpvid.identify._methods import AbstractSubspaceMethod
 _LARGEST_DEFAULT = 15
 # Output samples for each parameter of a model below which a fit is little more than a guess.
 _SAMPLES_A_PARAMETER = 10
+# From an input and the layout of its rows to their triangular factor.
+InputFactor = Callable[[int, Layout], np.ndarray]
+# Samples by which most channels have moved.
+_FIRST_LOOK = 64
 
 
 def make_layout(method: AbstractSubspaceMethod, data: IOData, lengths: tuple[int, ...]) -> Layout:
@@ -99,10 +106,7 @@ def check_varying(data: IOData, still: np.ndarray | None = None) -> None:
         ValueError: naming the first one found.
     """
     if still is None:
-        signals = [np.asarray(data.u), np.asarray(data.y)]
-        low = np.concatenate([signal.min(axis=0) for signal in signals])
-        high = np.concatenate([signal.max(axis=0) for signal in signals])
-        still = constant_channels(low, high)
+        still = _still(np.asarray(data.u), np.asarray(data.y))
     names = [*data.input_names, *data.output_names]
     for channel in np.flatnonzero(still):
         kind, remedy = (
@@ -115,9 +119,23 @@ def check_varying(data: IOData, still: np.ndarray | None = None) -> None:
         )
 
 
-def constant_channels(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _still(*signals: np.ndarray) -> np.ndarray:
+    """Which channels do not move. Most do within their first samples: the rest is not looked at."""
+    short = constant_channels(*_ends([signal[:_FIRST_LOOK] for signal in signals]), 2 * STILL)
+    # At twice the tolerance: should the level beyond double, the channel has moved by that much.
+    if not np.any(short):
+        return short
+    return constant_channels(*_ends(signals))
+
+
+def _ends(signals: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    low = np.concatenate([signal.min(axis=0) for signal in signals])
+    return low, np.concatenate([signal.max(axis=0) for signal in signals])
+
+
+def constant_channels(low: np.ndarray, high: np.ndarray, tolerance: float = STILL) -> np.ndarray:
     """Which channels do not move, from their least and largest samples."""
-    return high - low <= 1e-12 * np.maximum(np.abs(high), np.abs(low))
+    return high - low <= tolerance * np.maximum(np.abs(high), np.abs(low))
 
 
 def above_rank(order: int, singular_values: np.ndarray, rounding: float) -> str | None:
@@ -131,12 +149,18 @@ def above_rank(order: int, singular_values: np.ndarray, rounding: float) -> str 
     )
 
 
-def describe_excitation(data: IOData, layout: Layout, constant: bool) -> str:
-    """Which input excites too little for these block rows, and what to do."""
+def describe_excitation(names: Sequence[str], layout: Layout, factor: InputFactor) -> str:
+    """Which input excites too little for these block rows, and what to do.
+
+    Args:
+        names: of the inputs.
+        layout: of the data matrix.
+        factor: of the rows of some of the inputs.
+    """
     wanted = layout.input_rows // layout.nu
-    names, block_rows = data.input_names, layout.block_rows
+    block_rows = layout.block_rows
     for channel, name in enumerate(names):
-        rank = int(np.sum(_pivots(data, [channel], layout, constant) > RANK_TOLERANCE["qr"]))
+        rank = int(np.sum(_pivots(factor, channel, layout) > RANK_TOLERANCE["qr"]))
         if rank < wanted:
             return (
                 f"Input {name!r} excites {rank} of the {wanted} directions that block_rows="
@@ -146,21 +170,19 @@ def describe_excitation(data: IOData, layout: Layout, constant: bool) -> str:
             )
     return (
         f"The inputs {', '.join(names)} each move enough but not independently of one "
-        f"another (rank below {wanted * data.nu}): excite them by independent signals, or leave "
+        f"another (rank below {wanted * layout.nu}): excite them by independent signals, or leave "
         f"one out with data.select(inputs=...)."
     )
 
 
-def weak_excitation(data: IOData, layout: Layout, constant: bool, pivot: float) -> str:
-    """Which input only just excites enough, and what to do."""
-    alone = [
-        float(np.min(_pivots(data, [channel], layout, constant))) for channel in range(data.nu)
-    ]
+def weak_excitation(names: Sequence[str], layout: Layout, factor: InputFactor, pivot: float) -> str:
+    """Which input only just excites enough, and what to do: as for `describe_excitation`."""
+    alone = [float(np.min(_pivots(factor, k, layout))) for k in range(len(names))]
     worst = int(np.argmin(alone))
     advice = "widen its spectrum (PRBS, noise, faster steps), sample more slowly, or lower "
-    start = f"Input {data.input_names[worst]!r} hardly excites"
+    start = f"Input {names[worst]!r} hardly excites"
     if alone[worst] > 1e3 * pivot:
-        start = f"The inputs {', '.join(data.input_names)} hardly move independently"
+        start = f"The inputs {', '.join(names)} hardly move independently"
         advice = "excite them by independent signals, or lower "
     return (
         f"{start}: the weakest of the directions that block_rows={layout.block_rows} asks for has "
@@ -169,16 +191,20 @@ def weak_excitation(data: IOData, layout: Layout, constant: bool, pivot: float) 
     )
 
 
-def _pivots(data: IOData, channels: list[int], layout: Layout, constant: bool) -> np.ndarray:
-    """Share of every input row that the rows before it leave, for some of the inputs."""
-    # In the order of the data matrix: a sample between known ones is foretold best.
-    rows = layout._replace(nu=len(channels), ny=0, past_outputs=False).rows()
-    signal = data.u[:, np.array(channels)]
+def input_factor(data: IOData, channel: int, layout: Layout, constant: bool) -> np.ndarray:
+    """Lower triangle of the rows of `layout`, which are those of one input."""
+    signal = data.u[:, channel : channel + 1]
     if constant:
         signal = signal - signal.mean(axis=0, keepdims=True)
-    factor = np.asarray(hankel_factor(signal, data.lengths, rows, constant=constant))
-    power = np.maximum(np.sum(factor**2, axis=1), np.finfo(float).tiny)
-    return np.diagonal(factor) ** 2 / power
+    return np.asarray(hankel_factor(signal, data.lengths, layout.rows(), constant=constant))
+
+
+def _pivots(factor: InputFactor, channel: int, layout: Layout) -> np.ndarray:
+    """Share of every row of an input that the rows before it leave."""
+    # In the order of the data matrix: a sample between known ones is foretold best.
+    found = factor(channel, layout._replace(nu=1, ny=0, past_outputs=False))
+    power = np.maximum(np.sum(found**2, axis=1), np.finfo(float).tiny)
+    return np.diagonal(found) ** 2 / power
 
 
 def largest_order(block_rows: int, ny: int) -> int:

@@ -174,13 +174,6 @@ class ChunkedSource:
         """Samples of the one record, known once it was gone over."""
         return (self.n_samples,)
 
-    @property
-    def data(self) -> IOData:
-        """Samples to look at for the channel at fault: the first piece's (chunks may be short)."""
-        u, y = next(self.chunks.pieces(self.first, _PIECE))
-        names = {"u": self.first.input_names, "y": self.first.output_names}
-        return IOData(u=u, y=y, dt=self.first.dt, names=names)
-
     def check_varying(self) -> None:
         """Raise for a constant channel."""
         check_varying(self.first, self.still)
@@ -191,21 +184,34 @@ class ChunkedSource:
         columns = layout.columns((self.n_samples,))
         settings = dict(columns=columns, method=method, layout=layout, correlate=correlate)
         if route == "gram":
-            return _range_of_moments(moments, centre, scale, **settings)
-        constant = method.offset
+            found = _range_of_moments(moments, centre, scale, **settings)
+        else:
+            whole = self._triangle(layout, slice(None), centre, scale)
+            found = _range_of_triangle(whole, centre, scale, **settings)
+        return found | dict(still=jnp.asarray(np.any(self.still)))
+
+    def input_factor(self, channel: int, layout: Layout) -> np.ndarray:
+        """Triangle of the rows of one input, from a pass over all chunks."""
+        assert self._known is not None
+        _, centre, scale = self._known
+        alone = slice(channel, channel + 1)
+        return np.asarray(self._triangle(layout, alone, centre, scale))
+
+    def _triangle(self, layout: Layout, channels: slice, centre: Array, scale: Array) -> Array:
+        """Lower triangle of the rows of `layout`, of some of the channels."""
+        constant = self.method.offset
         upper = empty_triangle(layout.rows(), constant)
-        centres, scales = np.asarray(centre)[None], np.asarray(scale)[None]
+        centres, scales = np.asarray(centre)[None, channels], np.asarray(scale)[None, channels]
         edge = layout.n_lags - 1
         carry: np.ndarray | None = None
         for u, y in self.chunks.pieces(self.first, _PIECE):
-            w = (np.concatenate([u, y], axis=1) - centres) / scales
+            w = (np.concatenate([u, y], axis=1)[:, channels] - centres) / scales
             new = len(w) - edge if carry is None else len(w)
             joined = w if carry is None else np.concatenate([carry, w])
             padded = np.pad(joined, ((0, _PIECE + edge - len(joined)), (0, 0)))
             upper = _extend(upper, padded, new, layout=layout, constant=constant)
             carry = joined[-edge:]
-        whole = lower_factor(upper, constant)
-        return _range_of_triangle(whole, centre, scale, **settings)
+        return lower_factor(upper, constant)
 
     def _moments(self, layout: Layout) -> tuple[HankelMoments, Array, Array]:
         """Moments, centre and scale, from one pass over the data."""

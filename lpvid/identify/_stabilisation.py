@@ -1,5 +1,6 @@
 """Stabilisation diagram: the modes of models of many orders from one factorisation."""
 
+import functools
 import itertools
 from collections.abc import Sequence
 
@@ -10,7 +11,13 @@ import scipy  # its parts load when first used
 from jaxtyping import Array, Bool, Complex, Float
 
 from lpvid.data import IOData
-from lpvid.identify._checks import check_varying, largest_order, require_samples
+from lpvid.identify._checks import (
+    check_varying,
+    describe_excitation,
+    input_factor,
+    largest_order,
+    require_samples,
+)
 from lpvid.identify._engine import range_of_records
 from lpvid.identify._factor import ILL_CONDITIONED, Layout, Route
 from lpvid.identify._methods import AbstractSubspaceMethod, PastOutputMOESP, projection_only
@@ -86,7 +93,8 @@ def stabilisation(
         Modes, flags and what is drawn behind them.
 
     Raises:
-        ValueError: orders that do not rise, or above what the block rows carry; constant channels.
+        ValueError: orders that do not rise, or above what the block rows carry; constant channels,
+            inputs that excite too little.
 
     Example:
         >>> import numpy as np
@@ -119,6 +127,9 @@ def stabilisation(
     found = _range(data, method, layout, "gram")
     if not float(found["smallest_pivot"]) > ILL_CONDITIONED:
         found = _range(data, method, layout, "qr")
+    if int(found["excitation_rank"]) < layout.input_rows:
+        factor = functools.partial(input_factor, data, constant=method.offset)
+        raise ValueError(describe_excitation(data.input_names, layout, factor))
     values = np.asarray(found["singular_values"])
     observability = np.asarray(found["vectors"])[:, : wanted[-1]] * np.sqrt(values[: wanted[-1]])
     output_scale = np.asarray(found["scale"])[data.nu :]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
 
+from lpvid._results import Status
 from lpvid.data import IOData, join
 from lpvid.identify import (
     AbstractOrderRule,
@@ -16,6 +17,7 @@ from lpvid.identify import (
     identify,
     stabilisation,
 )
+from lpvid.identify._checks import check_varying
 
 from .helpers import common_problem, respond, three_modes
 
@@ -70,8 +72,10 @@ def test_constant_and_unexciting_inputs_beside_an_offset(record):
     with pytest.raises(ValueError, match=r"'pull' is constant.*leave it out with data.select"):
         identify(still, method)
     sine = np.column_stack([u[:, 0], np.sin(0.3 * np.arange(len(u)))])
-    with pytest.raises(ValueError, match=r"'pull' excites 2 of the 16 .*use a richer input"):
-        identify(IOData(u=sine, y=y, dt=DT, names=names), method)
+    data = IOData(u=sine, y=y, dt=DT, names=names)
+    for identified in (identify, lambda *both: stabilisation(*both, orders=[6])):
+        with pytest.raises(ValueError, match=r"'pull' excites 2 of the 16 .*use a richer input"):
+            identified(data, method)
 
 
 @pytest.mark.parametrize(
@@ -107,6 +111,28 @@ def test_constant_outputs_are_named_by_every_method(record, identified):
     data = IOData(u=u, y=np.column_stack([y[:, 0], 0.0 * y[:, 1] + 2.0]), dt=DT)
     with pytest.raises(ValueError, match=r"Output 'y2' is constant.*data.select\(outputs"):
         identified(data)
+
+
+@pytest.mark.parametrize("level", [0.0, 2.0])
+@pytest.mark.parametrize("chunked", [False, True])
+def test_a_constant_output_has_a_status_of_its_own(record, level, chunked):
+    u, y = record
+    data = IOData(u=u, y=np.column_stack([y[:, 0], 0.0 * y[:, 1] + level]), dt=DT)
+    method = PastInputMOESP(order=2, block_rows=8)
+    fit = identify(Chunks(lambda: [data]) if chunked else data, method, throw=False)
+    assert fit.status == Status.constant_channel
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_channel_that_moves_at_any_time_is_not_constant(late):
+    """However late, and whatever its level: it need only move by more than rounding."""
+    signal = np.full(500, 1e3)
+    signal[-1 if late else 1] += 1e-8
+    u = np.column_stack([np.arange(500.0), signal])
+    check_varying(IOData(u=u, y=u, dt=DT))
+    u[:, 1] = np.round(signal, 7)
+    with pytest.raises(ValueError, match="Input 'u2' is constant"):
+        check_varying(IOData(u=u, y=u, dt=DT))
 
 
 def test_an_order_above_the_rank_without_past_outputs(record):

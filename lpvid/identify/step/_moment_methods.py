@@ -15,7 +15,27 @@ from lpvid.models import StateSpace
 _LARGEST_ORDER = 20
 
 
-class PrimalRealisation(AbstractStepMethod):
+class _MomentMethod(AbstractStepMethod):
+    """What the method and its dual share: they differ in which factor gives A."""
+
+    dual: eqx.AbstractClassVar[bool]
+    integration: Integration = eqx.field(static=True, default="smooth")
+
+    def __check_init__(self):
+        if self.integration not in ("smooth", "held"):
+            raise ValueError(f'integration={self.integration!r}: give "smooth" or "held".')
+
+    def largest_order(self, ny: int, nu: int, time: int) -> int:
+        """Largest order that double precision carries."""
+        del ny, nu, time
+        return _LARGEST_ORDER
+
+    def realise(self, experiments: Experiments, order: int) -> Realisation:
+        """The continuous-time model of `order` states."""
+        return _realise(experiments, order=order, integration=self.integration, dual=self.dual)
+
+
+class PrimalRealisation(_MomentMethod):
     r"""The published method (003, equations 5 to 25): A from the observability matrix.
 
     $U(t) = [u_1 … ] [u_1(∞) …]^{-1}$, p_0 likewise from the outputs, ρ_0 = p_0(∞),
@@ -49,22 +69,10 @@ class PrimalRealisation(AbstractStepMethod):
         -3.0
     """
 
-    integration: Integration = eqx.field(static=True)
-
-    def __init__(self, integration: Integration = "smooth"):
-        self.integration = _checked(integration)
-
-    def largest_order(self, ny: int, nu: int, time: int) -> int:
-        """Largest order that double precision carries."""
-        del ny, nu, time
-        return _LARGEST_ORDER
-
-    def realise(self, experiments: Experiments, order: int) -> Realisation:
-        """The continuous-time model of `order` states."""
-        return _realise(experiments, order=order, integration=self.integration, dual=False)
+    dual = False
 
 
-class DualRealisation(AbstractStepMethod):
+class DualRealisation(_MomentMethod):
     r"""The published method's dual (003, section 2.4): A from the controllability matrix.
 
     As `PrimalRealisation`, but $\hat A = C_u C_d^†$ from the factor $C_o$, with α_u the integer in
@@ -87,25 +95,7 @@ class DualRealisation(AbstractStepMethod):
         1.0
     """
 
-    integration: Integration = eqx.field(static=True)
-
-    def __init__(self, integration: Integration = "smooth"):
-        self.integration = _checked(integration)
-
-    def largest_order(self, ny: int, nu: int, time: int) -> int:
-        """Largest order that double precision carries."""
-        del ny, nu, time
-        return _LARGEST_ORDER
-
-    def realise(self, experiments: Experiments, order: int) -> Realisation:
-        """The continuous-time model of `order` states."""
-        return _realise(experiments, order=order, integration=self.integration, dual=True)
-
-
-def _checked(integration: Integration) -> Integration:
-    if integration not in ("smooth", "held"):
-        raise ValueError(f'integration={integration!r}: give "smooth" or "held".')
-    return integration
+    dual = True
 
 
 def block_counts(order: int, ny: int, nu: int, dual: bool) -> tuple[int, int]:

@@ -164,6 +164,19 @@ def test_runs_under_jit_and_differentiates(clean, clean_fit):
     np.testing.assert_allclose(slope, difference, rtol=1e-3, atol=1e-3 * np.abs(difference).max())
 
 
+def test_few_samples_are_said(clean):
+    with pytest.warns(UserWarning, match="80 samples are few for order=4 .* Take 100 samples"):
+        identify_mechanical(clean[:80], ContinuousTimeMOESP(tau=0.15, block_rows=3), throw=False)
+
+
+def test_an_order_above_the_rank_of_the_data_is_said(clean):
+    """One displacement measured twice: three rows of it are three directions."""
+    twice = clean.replace(y=clean.y[:, :1] * np.array([[1.0, 2.0]]))
+    with pytest.warns(UserWarning, match=r"order=4 is above the numerical rank of the data \(3\)"):
+        fit = identify_mechanical(twice, ContinuousTimeMOESP(tau=0.15, block_rows=3), throw=False)
+    assert fit.status == Status.ill_conditioned or fit.status == Status.nonfinite
+
+
 def test_wrong_signs_are_said(clean):
     with pytest.warns(UserWarning, match="indefinite"):
         fit = identify_mechanical(clean.replace(u=-clean.u), ContinuousTimeMOESP(**FIXED))
