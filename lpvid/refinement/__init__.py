@@ -1,5 +1,9 @@
 """Refinement of models to the records: maximum likelihood, with its uncertainty."""
 
+from lpvid.refinement._coordinates import Selection as Selection
+from lpvid.refinement._coordinates import Ties as Ties
+from lpvid.refinement._coordinates import matching as matching
+from lpvid.refinement._coordinates import select as select
 from lpvid.refinement._losses import AbstractLoss as AbstractLoss
 from lpvid.refinement._losses import HuberLoss as HuberLoss
 from lpvid.refinement._losses import SquaredLoss as SquaredLoss

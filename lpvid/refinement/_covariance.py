@@ -3,13 +3,12 @@
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from lpvid._solve import Unknowns
-from lpvid.refinement._criterion import Problem, over_records
+from lpvid.refinement._criterion import Problem
+from lpvid.refinement._levenberg_marquardt import Unknowns
 from lpvid.refinement._losses import covariance, inverse_factor
 
 # Eigenvalues of the correlation matrix below this share of the largest are rounding.
@@ -34,6 +33,7 @@ class Uncertainty(eqx.Module):
 
 def uncertainty(
     problem: Problem,
+    projected: Callable[[Unknowns, Array, Array], tuple[Array, Array]],
     at: Unknowns,
     residual: Float[Array, "record time ny"],
     held: Bool[Array, " coordinate"],
@@ -49,6 +49,8 @@ def uncertainty(
 
     Args:
         problem: in coordinates about the solution.
+        projected: whitened sensitivities by the coordinates, the states eliminated, and orthonormal
+            ones by the first states, from a point, a whitening factor and what is not held.
         at: the solution.
         residual: there.
         held: coordinates at a bound: taken as known.
@@ -62,22 +64,7 @@ def uncertainty(
     factor = inverse_factor(noise)
     lags = min(int(2.0 * longest**0.5) + 1, longest - 1)
     length = 1 << (longest + lags - 1).bit_length()
-    prepared, tangents = problem.tangents(at)
-    count = problem.basis.shape[1]
-    kept = jnp.where(held, 0.0, 1.0)
-
-    def one(each):
-        record, mask, own, x0 = each
-        by_shared, by_own = problem.sensitivity(prepared, tangents, record, mask, own, x0)
-        by_shared = (by_shared * kept[:, None, None]) @ factor.T
-        if not own.shape[0]:
-            return by_shared, by_own
-        by_own = _orthonormal((by_own @ factor.T).reshape(own.shape[0], -1))
-        flat = by_shared.reshape(count, -1)
-        left = flat - (flat @ by_own.T) @ by_own
-        return left.reshape(by_shared.shape), by_own.reshape(own.shape[0], longest, ny)
-
-    shared, own = over_records(one, (problem.records, mask, at.own, problem.x0))
+    shared, own = projected(at, factor, jnp.where(held, 0.0, 1.0))
     information = jnp.einsum("rpta,rqta->pq", shared, shared)
     inverse, silent = _inverse(information, held)
     waves = jnp.fft.rfft(shared, length, axis=2)
@@ -99,16 +86,6 @@ def uncertainty(
         robust_covariance=basis @ (0.5 * (robust + robust.T)) @ basis.T,
         unidentified=silent(basis) > _PART,
     )
-
-
-def _orthonormal(own: Float[Array, "own sample"]) -> Float[Array, "own sample"]:
-    """Orthonormal rows of the same span (zeros for what moves nothing)."""
-    size = jnp.linalg.norm(own, axis=1, keepdims=True)
-    own = own / jnp.where(size > 0.0, size, 1.0)
-    values, vectors = jnp.linalg.eigh(own @ own.T)
-    told = values > _RANK
-    roots = jnp.where(told, jax.lax.rsqrt(jnp.where(told, values, 1.0)), 0.0)
-    return (vectors * roots[None, :]).T @ own
 
 
 def _smoothed(raw: Array, lags: int, length: int, samples: Array) -> Array:

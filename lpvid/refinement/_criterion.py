@@ -7,9 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lpvid._solve import NormalEquations, Unknowns
+from lpvid.refinement._levenberg_marquardt import NormalEquations, Unknowns
 from lpvid.refinement._losses import AbstractLoss, Mask, Residual
 from lpvid.refinement._parameterisation import AbstractParameterisation, Record
+
+# Eigenvalues of states' sensitivities below this share of the largest are rounding.
+_RANK = 1e-12
 
 
 class Problem(eqx.Module):
@@ -120,6 +123,35 @@ class Problem(eqx.Module):
             own_matrix=matrices[:, count:, count:],
             coupling=matrices[:, :count, count:],
         )
+
+    def projected(
+        self, at: Unknowns, factor: Float[Array, "ny ny"], kept: Float[Array, " coordinate"]
+    ) -> tuple[Float[Array, "record coordinate time ny"], Float[Array, "record own time ny"]]:
+        """Whitened sensitivities, the initial states eliminated; and orthonormal ones by these."""
+        prepared, tangents = self.tangents(at)
+
+        def one(each):
+            record, mask, own, x0 = each
+            by_shared, by_own = self.sensitivity(prepared, tangents, record, mask, own, x0)
+            by_shared = (by_shared * kept[:, None, None]) @ factor.T
+            if not own.shape[0]:
+                return by_shared, by_own
+            rows = _orthonormal((by_own @ factor.T).reshape(own.shape[0], -1))
+            flat = by_shared.reshape(kept.shape[0], -1)
+            left = flat - (flat @ rows.T) @ rows
+            return left.reshape(by_shared.shape), rows.reshape(by_own.shape)
+
+        return over_records(one, (self.records, self.mask, at.own, self.x0))
+
+
+def _orthonormal(own: Float[Array, "own sample"]) -> Float[Array, "own sample"]:
+    """Orthonormal rows of the same span (zeros for what moves nothing)."""
+    size = jnp.linalg.norm(own, axis=1, keepdims=True)
+    own = own / jnp.where(size > 0.0, size, 1.0)
+    values, vectors = jnp.linalg.eigh(own @ own.T)
+    told = values > _RANK
+    roots = jnp.where(told, jax.lax.rsqrt(jnp.where(told, values, 1.0)), 0.0)
+    return (vectors * roots[None, :]).T @ own
 
 
 def over_records(function, arguments):

@@ -99,3 +99,15 @@ class ModuleParameterisation(AbstractParameterisation):
             options["kappa"] = record.kappa
         model = self.build(prepared)
         return model.simulate(u=record.u, dt=self.dt, **options)
+
+    @property
+    def overlap(self) -> int:
+        """Twice the order: states are met through the outputs that follow from them."""
+        return 2 * self.states
+
+    def shoot(
+        self, prepared: Float[Array, " value"], record: Record, x0: Array, size: int
+    ) -> tuple[Float[Array, "time ny"], Float[Array, " row"], Float[Array, " row"]]:
+        """Simulated output, and its first and its overlapping samples."""
+        y = self.respond(prepared, record, x0)
+        return y[:size], y[: self.overlap].reshape(-1), y[size:].reshape(-1)

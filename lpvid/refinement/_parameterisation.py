@@ -4,7 +4,6 @@ import abc
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -57,6 +56,24 @@ class AbstractParameterisation(eqx.Module):
     @abc.abstractmethod
     def respond(self, prepared: Any, record: Record, x0: Array) -> Float[Array, "time ny"]:
         """Predicted output of one record."""
+
+    @property
+    @abc.abstractmethod
+    def overlap(self) -> int:
+        """Samples of the next piece that `shoot` simulates to meet it."""
+
+    @abc.abstractmethod
+    def shoot(
+        self, prepared: Any, record: Record, x0: Array, size: int
+    ) -> tuple[Float[Array, "time ny"], Float[Array, " row"], Float[Array, " row"]]:
+        """Output of a piece, and the rows by which it meets the piece before it and the next.
+
+        Args:
+            prepared: what all records share.
+            record: the piece, and `overlap` samples of the next one.
+            x0: its first state.
+            size: samples of the piece.
+        """
 
     @abc.abstractmethod
     def build(self, values: Values) -> Any:
@@ -151,6 +168,21 @@ class LinearParameterisation(AbstractParameterisation):
         predictor = StateSpace(prepared.A, prepared.B, prepared.C, prepared.D, dt=1.0)
         return predictor.simulate(u=u, x0=x0)
 
+    @property
+    def overlap(self) -> int:
+        """None: pieces meet in their states."""
+        return 0
+
+    def shoot(
+        self, prepared: StateSpace, record: Record, x0: Array, size: int
+    ) -> tuple[Float[Array, "time ny"], Float[Array, " nx"], Float[Array, " nx"]]:
+        """Simulated output, first state, and the state after the last sample."""
+        del size
+        system = StateSpace(prepared.A, prepared.B, prepared.C, prepared.D, dt=1.0)
+        states = system.simulate_states(u=record.u, x0=x0)
+        y = states @ system.C.T + record.u @ system.D.T
+        return y, x0, system.A @ states[-1] + system.B @ record.u[-1]
+
     def build(self, values: Values) -> StateSpace | StructuredModel:
         """A `StateSpace` in the time it was given in, or a `StructuredModel`."""
         parameters = values[: self.structure.n_parameters]
@@ -224,15 +256,3 @@ def padded_records(data: IOData) -> tuple[Record, Array]:
     mask = np.arange(longest)[None, :] < np.asarray(data.lengths)[:, None]
     kappa = None if data.kappa is None else stack(data.kappa)
     return Record(stack(data.u), stack(data.y), kappa), jnp.asarray(mask)
-
-
-def cut_up(records: Record, mask: Array, length: int) -> tuple[Record, Array]:
-    """Every record cut into pieces of nearly `length` samples, along the leading axis."""
-    count = -(-mask.shape[1] // length)
-    size = -(-mask.shape[1] // count)
-
-    def cut(signal: Array) -> Array:
-        missing = ((0, 0), (0, count * size - mask.shape[1]), *((0, 0),) * (signal.ndim - 2))
-        return jnp.pad(signal, missing).reshape(-1, size, *signal.shape[2:])
-
-    return jax.tree.map(cut, records), cut(mask)

@@ -17,14 +17,16 @@ class OutputError(AbstractPredictor):
     The estimate is consistent for coloured noise too, as long as it does not come from the input
     (no feedback).
 
-    With `shooting` the search goes through pieces of the records, each from a state of its own:
-    over so few samples nothing grows out of bounds, and a poor start does not run away. The pieces
-    then become eight times longer, from the last solution, until each is a whole record; the end is
-    the same maximum of the likelihood as without. For poor or unstable starts, and for unstable and
-    integrating plants.
+    With `shooting` the records are cut into pieces, each from a state of its own: over so few
+    samples nothing grows out of bounds, and a poor start does not run away. The pieces are free at
+    first and then made to meet, by an augmented Lagrangian whose weight rises from round to round;
+    the end is the same maximum of the likelihood, with the same covariance, as without. For poor or
+    unstable starts, and for unstable and integrating plants, however much they grow over the
+    record. The largest gap that is left, over the size of the state (of an LPV or other module: of
+    the output), is in `Refined.stats["largest_gap"]`; above 1e-8 the status says so.
 
     Attributes:
-        shooting: samples in the first pieces; None for whole records at once.
+        shooting: samples in a piece; None for whole records at once.
 
     Raises:
         ValueError: `shooting` is below two.

@@ -137,7 +137,9 @@ def profile_likelihood(
         values = np.unique(np.asarray(points, float).reshape(-1))
     records = padded_records(data)
     found = task.selection.chosen(refined.parameters)
-    own = refined.x0 if task.free_start else refined.x0[:, :0]
+    own = task.own(*records[1].shape)
+    if task.free_start:
+        own = own.at[:, : refined.x0.shape[1]].set(refined.x0)
     increase, statuses = np.zeros(values.size), [Status.successful] * values.size
     centre = int(np.searchsorted(values, float(estimate)))
     for side in (range(centre, values.size), range(centre - 1, -1, -1)):
@@ -148,11 +150,10 @@ def profile_likelihood(
                 task.bounds.upper.at[column].set(values[i]),
             )
             there = eqx.tree_at(lambda t: t.bounds, task, held)
-            chosen, starts, solution, _ = search(
-                there, *records, chosen, starts, jnp.asarray(max_steps)
-            )
-            increase[i] = float(solution.cost - refined.cost)
-            statuses[i] = solution.status
+            at = search(there, *records, chosen, starts, jnp.asarray(max_steps))
+            chosen, starts = at.chosen, at.own
+            increase[i] = float(at.solution.cost - refined.cost)
+            statuses[i] = at.solution.status
     return ProfileLikelihood(
         name=name,
         estimate=estimate,

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,17 +18,12 @@ from lpvid.refinement._losses import AbstractLoss, SquaredLoss
 from lpvid.refinement._parameterisation import (
     AbstractParameterisation,
     LinearParameterisation,
-    Record,
-    cut_up,
     padded_records,
 )
 from lpvid.refinement._predictors import AbstractPredictor, OutputError
 from lpvid.refinement._recognise import Start, recognise
 from lpvid.refinement._refined import Refined
-from lpvid.refinement._search import Outcome, Task, assess, search, start_residual
-
-# How much longer the pieces of a shooting search become each time.
-_LONGER = 8
+from lpvid.refinement._search import Outcome, Task, assess, search
 
 
 def refine(
@@ -78,7 +72,7 @@ def refine(
         initial_state: `"free"` (estimated, one a record), `"zero"`, or known states (nx,) or
             (record, nx).
         max_steps: limit on the trial steps.
-        throw: raise where no fit came out. `False` returns it with its status.
+        throw: raise where no fit came out. `False` returns it with its status, and warns.
 
     Returns:
         The model and what is known about it.
@@ -114,59 +108,27 @@ def refine(
     if offset is not None:
         data = data.replace(y=data.y - offset[None])
     start = recognise(model, data, predictor)
-    task, chosen, own = prepare(start, data, loss, bounds, fixed, tied, initial_state)
+    task, chosen = prepare(start, data, predictor, loss, bounds, fixed, tied, initial_state)
     records = padded_records(data)
-    found, starts = _shoot(task, records, predictor, chosen, own, max_steps)
-    shot = found is not chosen
-    found, starts, solution, ends = search(task, *records, found, starts, jnp.asarray(max_steps))
-    if shot:
-        ends = start_residual(task, *records, chosen, own), ends[1]
-    outcome = assess(task, *records, found, starts, solution, ends)
+    own = task.own(*records[1].shape)
+    found = search(task, *records, chosen, own, jnp.asarray(max_steps))
+    outcome = assess(task, *records, found)
     refined = as_refined(task, outcome, data, offset)
     if not isinstance(refined.cost, Tracer):
         _report(refined, throw)
     return refined
 
 
-def _shoot(
-    task: Task,
-    records: tuple[Record, Array],
-    predictor: AbstractPredictor,
-    chosen: Array,
-    own: Array,
-    max_steps: int,
-) -> tuple[Array, Array]:
-    """Searches over pieces of the records, longer and longer; the start where none are asked."""
-    first = predictor.shooting if isinstance(predictor, OutputError) else None
-    if first is None:
-        return chosen, own
-    if not task.free_start:
-        raise ValueError("initial_state: shooting frees the state of every piece; use 'free'.")
-    count, longest = records[1].shape
-    length, pieces = first, own
-    while length < longest:
-        cut = cut_up(*records, length)
-        each = cut[1].shape[0] // count
-        # A new piece starts where the old one that covers its beginning did.
-        pieces = pieces.reshape(count, -1, own.shape[1])
-        covering = np.arange(each) * pieces.shape[1] // each
-        pieces = pieces[:, covering].reshape(-1, own.shape[1])
-        states = jnp.zeros((pieces.shape[0], task.x0.shape[1]))
-        piecewise = eqx.tree_at(lambda t: t.x0, task, states)
-        chosen, pieces, _, _ = search(piecewise, *cut, chosen, pieces, jnp.asarray(max_steps))
-        length *= _LONGER
-    return chosen, pieces.reshape(count, -1, own.shape[1])[:, 0]
-
-
 def prepare(
     start: Start,
     data: IOData,
+    predictor: AbstractPredictor,
     loss: AbstractLoss,
     bounds: Mapping[str, tuple[float, float]] | None,
     fixed: Sequence[str],
     tied: Ties,
     initial_state: str | ArrayLike,
-) -> tuple[Task, Float[Array, " chosen"], Float[Array, "record own"]]:
+) -> tuple[Task, Float[Array, " chosen"]]:
     """The task, and where its search starts."""
     kind = start.parameterisation
     selection = select(kind.names, start.values, fixed, tied)
@@ -186,7 +148,9 @@ def prepare(
             )
     chosen, inner_lower, inner_upper = _chosen(selection, start.values, lower, upper)
     free, x0 = _initial_state(initial_state, kind, black_box, len(data.lengths))
-    own = jnp.zeros((len(data.lengths), kind.n_states if free else 0))
+    shooting = predictor.shooting if isinstance(predictor, OutputError) else None
+    if shooting is not None and not kind.n_states:
+        raise ValueError("predictor: shooting needs a model with states; this one names none.")
     task = Task(
         parameterisation=kind,
         loss=loss,
@@ -195,8 +159,9 @@ def prepare(
         x0=x0,
         free_start=free,
         remaining=remaining,
+        shooting=None if shooting is None else min(shooting, max(data.lengths)),
     )
-    return task, chosen, own
+    return task, chosen
 
 
 def _check_basis_free(kind: AbstractParameterisation, fixed: Sequence[str], tied: Ties) -> None:
@@ -290,6 +255,7 @@ def as_refined(
             "degrees_of_freedom": jnp.asarray(outcome.degrees_of_freedom),
             "unidentified": outcome.unidentified,
             "at_bound": outcome.at_bound,
+            "largest_gap": outcome.gap,
         },
         task=task,
     )
@@ -301,5 +267,4 @@ def _report(refined: Refined, throw: bool) -> None:
         return
     if throw and (refined.status == Status.nonfinite or refined.status == Status.overflow):
         raise ValueError(f"The fit failed. {refined.advice} throw=False returns it as it is.")
-    if throw:
-        warnings.warn(f"refine: {refined.advice}", stacklevel=3)
+    warnings.warn(f"refine: {refined.advice}", stacklevel=3)

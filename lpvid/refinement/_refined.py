@@ -34,7 +34,8 @@ class Refined(eqx.Module):
         initial_cost: the loss at the start.
         status: how it ended; `advice` says it with the parameters' names.
         stats: arrays by name: `steps`, `degrees_of_freedom` (unknowns estimated), `unidentified`
-            and `at_bound`, (parameter,).
+            and `at_bound`, (parameter,), `largest_gap` between the pieces of a shooting search
+            (over the root mean square of the state there; zero without).
         task: what was fitted, for `profile_likelihood`.
     """
 

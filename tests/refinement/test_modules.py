@@ -112,7 +112,8 @@ def test_shooting_reaches_what_a_poor_start_cannot():
     clean = np.asarray(structure.matrices(jnp.asarray(truth)).simulate(u=u, dt=DT))
     data = IOData(u=u, y=clean + 0.05 * rng.standard_normal(clean.shape), dt=DT)
     start = StructuredModel(structure, [4.0, 0.0, 0.5])
-    failed = refine(start, data, throw=False)
+    with pytest.warns(UserWarning, match="refine: "):
+        failed = refine(start, data, throw=False)
     assert failed.status != Status.successful
     fit = refine(start, data, predictor=OutputError(shooting=20))
     assert fit.status == Status.successful

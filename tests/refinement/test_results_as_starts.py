@@ -56,6 +56,11 @@ def test_entries_of_a_black_box_cannot_be_held(refined):
         refine(refined, SHIFTED, bounds={"A*": (0.0, 1.0)})
 
 
+def test_entries_of_a_black_box_have_no_profile(refined):
+    with pytest.raises(ValueError, match="profile a StructuredModel"):
+        profile_likelihood(refined, SHIFTED, "A[0,0]")
+
+
 @pytest.mark.slow
 def test_a_robust_loss_has_no_profile(refined):
     robust = refine(refined, SHIFTED, loss=HuberLoss())
