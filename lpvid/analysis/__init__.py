@@ -2,6 +2,9 @@
 
 from lpvid.analysis._band_fit import band_fit as band_fit
 from lpvid.analysis._band_fit import band_lines as band_lines
+from lpvid.analysis._eigensolvers import AbstractEigensolver as AbstractEigensolver
+from lpvid.analysis._eigensolvers import Lapack as Lapack
+from lpvid.analysis._eigensolvers import SimultaneousIteration as SimultaneousIteration
 from lpvid.analysis._h2 import h2_norm as h2_norm
 from lpvid.analysis._hinf import HinfNorm as HinfNorm
 from lpvid.analysis._hinf import hinf_norm as hinf_norm

@@ -10,15 +10,16 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from lpvid._results import Status
+from lpvid.analysis._eigensolvers import AbstractEigensolver, default_eigensolver
 from lpvid.analysis._level_set import certify_by_hamiltonian, sweep_modal
 from lpvid.analysis._modal import (
     Modal,
     modal_form,
+    reduced_form,
     refine_peaks,
     response,
     rounding,
     squared_gain,
-    triangular_form,
     trustworthy,
 )
 from lpvid.models import StateSpace
@@ -40,7 +41,12 @@ class HinfNorm(eqx.Module):
     status: Status
 
 
-def hinf_norm(system: StateSpace, *, tolerance: float = 1e-10) -> HinfNorm:
+def hinf_norm(
+    system: StateSpace,
+    *,
+    tolerance: float = 1e-10,
+    eigensolver: AbstractEigensolver | None = None,
+) -> HinfNorm:
     """Largest singular value of the frequency response over all frequencies.
 
     The gain is raised to the local maxima near the poles' frequencies by Newton steps, then the
@@ -53,13 +59,15 @@ def hinf_norm(system: StateSpace, *, tolerance: float = 1e-10) -> HinfNorm:
     tie, zero where the norm is infinite. First derivatives only; `frequency` has none. Works under
     `jit` and `vmap`. A batch costs least as leading axes of `system` or through `vmap`; a system
     for which the cheap certificate (an eigenproblem of size n) does not hold is then treated on its
-    own by the Hamiltonian of size 2 n, whose Schur form needs LAPACK and therefore a CPU.
+    own by the Hamiltonian of size 2 n.
 
     Args:
         system: continuous (`dt = 0`) or discrete model with nx >= 1 states, with or without D, with
             any leading batch axes.
         tolerance: relative accuracy of the value, between 1e-13 and 1e-1. Values below the rounding
             errors of the response (a difference of equal systems) are accurate to those.
+        eigensolver: `Lapack()`, for CPUs, or `SimultaneousIteration()`, for every device; by
+            default the first where JAX's default device is a CPU, the second elsewhere.
 
     Returns:
         The norm in the unit of output over input, its frequency in rad/s and the status.
@@ -82,7 +90,8 @@ def hinf_norm(system: StateSpace, *, tolerance: float = 1e-10) -> HinfNorm:
     batch = system.A.shape[:-2]
     flat = tuple(m.reshape(-1, *m.shape[-2:]) for m in matrices)
     solve = _norms if any(isinstance(m, Tracer) for m in matrices) else _norms_jitted
-    value, omega, status = solve(flat, system.dt, tolerance)
+    eigensolver = default_eigensolver() if eigensolver is None else eigensolver
+    value, omega, status = solve(flat, system.dt, tolerance, eigensolver)
     status = jax.tree.map(lambda code: code.reshape(batch), status)
     return HinfNorm(value.reshape(batch), omega.reshape(batch), status)
 
@@ -100,14 +109,15 @@ def check_system(system: StateSpace) -> None:
             )
 
 
-def _norms(matrices, dt: float, tolerance: float):
-    return jax.vmap(partial(_norm, dt=dt, tolerance=tolerance))(*matrices)
+def _norms(matrices, dt: float, tolerance: float, eigensolver: AbstractEigensolver):
+    norm = partial(_norm, dt=dt, tolerance=tolerance, eigensolver=eigensolver)
+    return jax.vmap(norm)(*matrices)
 
 
-_norms_jitted = jax.jit(_norms, static_argnums=(1, 2))
+_norms_jitted = jax.jit(_norms, static_argnums=(1, 2, 3))
 
 
-def _norm(A, B, C, D, *, dt: float, tolerance: float):
+def _norm(A, B, C, D, *, dt: float, tolerance: float, eigensolver: AbstractEigensolver):
     """One system: peak frequency by the level sets, value and derivative from that frequency."""
     fixed = lax.stop_gradient((A, B, C, D))
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(m)) for m in fixed]))
@@ -116,7 +126,7 @@ def _norm(A, B, C, D, *, dt: float, tolerance: float):
     still = -eye if dt == 0.0 else jnp.zeros_like(eye)
     fixed = (jnp.where(finite, fixed[0], still), *(jnp.where(finite, m, 0.0) for m in fixed[1:]))
     continuous, unit = to_normalised_continuous(*fixed, dt=dt)
-    form = modal_form(*continuous)
+    form = modal_form(*continuous, eigensolver)
     stable, boundary = _stability(form.poles, dt)
     boundary = boundary & finite
     usable = ~boundary & finite & jnp.isfinite(jnp.sum(continuous[0]))
@@ -124,7 +134,7 @@ def _norm(A, B, C, D, *, dt: float, tolerance: float):
         jnp.where(usable, continuous[0], -eye),
         *(jnp.where(usable, m, 0.0) for m in continuous[1:]),
     )
-    omega, done = largest_peak(form, continuous, usable, tolerance)
+    omega, done = largest_peak(form, continuous, usable, tolerance, eigensolver)
     frequency = from_normalised(omega, unit, dt)
     attained = usable & done
     value = _gain_at(A, B, C, D, *_point(omega, unit, dt), usable)
@@ -194,7 +204,9 @@ def candidates(form: Modal):
     return jnp.append(omega, 0.0), jnp.append(rate, jnp.min(size))
 
 
-def largest_peak(form: Modal, continuous, usable, tolerance: float):
+def largest_peak(
+    form: Modal, continuous, usable, tolerance: float, eigensolver: AbstractEigensolver
+):
     """Peak frequency (normalised) and whether the certificate came to an end."""
     A, B, C, D = continuous
     direct = _direct_gain(D)
@@ -209,12 +221,12 @@ def largest_peak(form: Modal, continuous, usable, tolerance: float):
     noise = rounding(form)
     # The cheap route needs partial fractions, and a level clear of the gain at infinity.
     cheap = trustworthy(form) & (direct < 0.999 * gain)
-    higher, place, sound = sweep_modal(form, gain, tolerance, noise)
+    higher, place, sound = sweep_modal(form, gain, tolerance, noise, eigensolver)
     certified = cheap & sound & (higher <= gain * (1.0 + tolerance) + noise)
     start = jnp.where(cheap & (higher > gain), place, peak)
     # A batch of one; `vmap` makes it longer.
     arguments = (certified | ~usable, peak, start, noise, A, B, C, D)
-    omega, done = _repair(tolerance)(*(value[None] for value in arguments))
+    omega, done = _repair(tolerance, eigensolver)(*(value[None] for value in arguments))
     return omega[0], done[0]
 
 
@@ -222,12 +234,14 @@ def _direct_gain(D):
     return jnp.sqrt(squared_gain(D[None].astype(complex))[0])
 
 
-def _repair(tolerance: float):
+def _repair(tolerance: float, eigensolver: AbstractEigensolver):
     """The general level-set loop for those of a batch whose cheap certificate did not hold.
 
     Under a plain `vmap` every system would pay for the dearest. Here the loop runs over the failed
     ones alone, and `vmap` only makes the batch longer.
     """
+
+    general = partial(_general, tolerance=tolerance, eigensolver=eigensolver)
 
     @jax.custom_batching.custom_vmap
     def run(certified, peak, start, noise, A, B, C, D):
@@ -238,18 +252,18 @@ def _repair(tolerance: float):
             omega, done = lax.cond(
                 certified[0],
                 lambda: (peak[0], certified[0]),
-                lambda: _general(*(value[0] for value in rest), tolerance=tolerance),
+                lambda: general(*(value[0] for value in rest)),
             )
             return omega[None], done[None]
         (failed,) = jnp.nonzero(~certified, size=count, fill_value=0)
 
-        def general(position, carry):
+        def repair_one(position, carry):
             omega, done = carry
             index = failed[position]
-            found, ended = _general(*(value[index] for value in rest), tolerance=tolerance)
+            found, ended = general(*(value[index] for value in rest))
             return omega.at[index].set(found), done.at[index].set(ended)
 
-        return lax.fori_loop(0, jnp.sum(~certified), general, (peak, certified))
+        return lax.fori_loop(0, jnp.sum(~certified), repair_one, (peak, certified))
 
     @run.def_vmap
     def lengthen(axis_size, in_batched, *arguments):
@@ -263,13 +277,14 @@ def _repair(tolerance: float):
     return run
 
 
-def _general(start, noise, A, B, C, D, *, tolerance: float):
+def _general(start, noise, A, B, C, D, *, tolerance: float, eigensolver: AbstractEigensolver):
     omega = jnp.where(jnp.isfinite(start), start, 0.0)
-    at_start = jnp.sqrt(squared_gain(response(triangular_form(A, B, C, D), omega[None]))[0])
+    form = reduced_form(A, B, C, D, eigensolver)
+    at_start = jnp.sqrt(squared_gain(response(form, omega[None]))[0])
     direct = _direct_gain(D)
     gain = jnp.maximum(at_start, direct)
     omega = jnp.where(direct >= at_start, jnp.inf, omega)
-    return certify_by_hamiltonian(A, B, C, D, gain, omega, tolerance, noise)
+    return certify_by_hamiltonian(A, B, C, D, gain, omega, tolerance, noise, eigensolver)
 
 
 @jax.custom_jvp

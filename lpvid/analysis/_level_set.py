@@ -10,16 +10,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from lpvid._types import Scalar
-from lpvid.analysis._modal import (
-    Modal,
-    reciprocal,
-    response,
-    squared_gain,
-    triangular_form,
-)
+from lpvid.analysis._eigensolvers import AbstractEigensolver
+from lpvid.analysis._modal import Modal, reciprocal, reduced_form, response, squared_gain
 
 
-def secular_frequencies(form: Modal, level: Scalar) -> tuple[Float[Array, " nx"], Bool[Array, ""]]:
+def secular_frequencies(
+    form: Modal, level: Scalar, eigensolver: AbstractEigensolver
+) -> tuple[Float[Array, " nx"], Bool[Array, ""]]:
     """Frequencies around which the gain can reach `level`, and whether they can be trusted.
 
     f(x) = det(level^2 I - G(-s)^T G(s)) is even in s and rational in x = s^2 with simple poles at
@@ -70,23 +67,9 @@ def secular_frequencies(form: Modal, level: Scalar) -> tuple[Float[Array, " nx"]
     else:
         limit = jnp.linalg.det(direct)
 
-    # Conjugate pairs (adjacent, positive imaginary part first, as LAPACK returns them) become real
-    # 2 x 2 blocks: a real eigenproblem costs half of a complex one.
-    weights = rho * (-1.0 / limit).astype(rho.dtype)
-    head = poles.imag > 0.0
-    tail = poles.imag < 0.0
-    spread = jnp.sqrt(jnp.abs(weights))
-    spread = jnp.where(spread > 0.0, spread, 1.0)
-    column = weights / spread.astype(weights.dtype)
-    # rho / (x - mu) + conj = [1, 0] (x - block)^-1 [2 Re, -2 Im] of the pair's head.
-    following = jnp.roll(column.imag, 1)
-    column_real = jnp.where(head, 2.0 * column.real, jnp.where(tail, -2.0 * following, column.real))
-    row = jnp.where(tail, 0.0, spread)
-    upper = jnp.where(head, squares.imag, 0.0)[:-1]
-    matrix = jnp.diag(squares.real) + jnp.diag(upper, 1) - jnp.diag(upper, -1)
-    roots = jnp.linalg.eigvals(matrix + column_real[:, None] * row[None, :])
+    roots, complete = eigensolver.zeros(limit, rho, poles)
 
-    # Check what was computed: every root has to be one, and pairs have to be pairs.
+    # Check what was computed: every root has to be one.
     inverse = reciprocal(roots[:, None] - squares[None, :])
     terms = inverse * rho[None, :]
     value = limit.astype(terms.dtype) + jnp.sum(terms, axis=1)
@@ -94,8 +77,7 @@ def secular_frequencies(form: Modal, level: Scalar) -> tuple[Float[Array, " nx"]
     error = jnp.abs(value) <= 1e-6 * jnp.maximum(
         jnp.abs(slope) * jnp.abs(roots), 1e-6 * (jnp.abs(limit) + jnp.sum(jnp.abs(terms), axis=1))
     )
-    paired = jnp.where(head, jnp.abs(jnp.roll(poles, -1) - poles.conj()), 0.0)
-    sound = jnp.all(error) & jnp.all(paired <= 1e-12 * jnp.abs(poles)) & (limit > 0.0)
+    sound = jnp.all(error) & complete & (limit > 0.0)
     return jnp.sqrt(jnp.maximum(-roots.real, 0.0)), sound
 
 
@@ -107,13 +89,13 @@ def between(omega: Float[Array, " frequency"]) -> Float[Array, " frequency"]:
 
 
 def sweep_modal(
-    form: Modal, gain: Scalar, tolerance: float, noise: Scalar
+    form: Modal, gain: Scalar, tolerance: float, noise: Scalar, eigensolver: AbstractEigensolver
 ) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
     """The highest gain, and its frequency, between the frequencies that reach `gain`.
 
     The last value says whether the frequencies could be trusted.
     """
-    crossings, sound = secular_frequencies(form, gain * (1.0 + tolerance) + noise)
+    crossings, sound = secular_frequencies(form, gain * (1.0 + tolerance) + noise, eigensolver)
     trial = between(crossings)
     gains = squared_gain(response(form, trial))
     best = jnp.argmax(gains)
@@ -145,6 +127,7 @@ def certify_by_hamiltonian(
     omega: Scalar,
     tolerance: float,
     noise: Scalar,
+    eigensolver: AbstractEigensolver,
     max_steps: int = 40,
 ) -> tuple[Scalar, Bool[Array, ""]]:
     """Raise `gain`, attained at `omega`, until no frequency exceeds it by `tolerance` and `noise`.
@@ -171,12 +154,13 @@ def certify_by_hamiltonian(
         for new, old in ((inverse, A), (-static, B), (C @ (-inverse), C), (at_zero, D))
     )
     omega = jnp.where(flip, 1.0 / omega, omega)
-    form = triangular_form(A, B, C, D)
+    form = reduced_form(A, B, C, D, eigensolver)
 
     def sweep(carry):
-        gain, omega, _, steps = carry
+        gain, omega, _, steps, _ = carry
         level = gain * (1.0 + tolerance) + noise / size + 1e-30
-        crossings = jnp.abs(jnp.linalg.eigvals(hamiltonian(A, B, C, D, level)).imag)
+        roots, complete = eigensolver.eigenvalues(hamiltonian(A, B, C, D, level))
+        crossings = jnp.abs(roots.imag)
         trial = between(jnp.where(jnp.isfinite(crossings), crossings, 0.0))
         gains = squared_gain(response(form, trial))
         best = jnp.argmax(gains)
@@ -187,10 +171,11 @@ def certify_by_hamiltonian(
             jnp.where(higher, trial[best], omega),
             ~higher,
             steps + 1,
+            complete,
         )
 
-    start = (gain / size, omega, jnp.array(False), jnp.array(0))
-    _, omega, done, _ = lax.while_loop(
+    start = (gain / size, omega, jnp.array(False), jnp.array(0), jnp.array(True))
+    _, omega, ended, _, complete = lax.while_loop(
         lambda carry: ~carry[2] & (carry[3] < max_steps), sweep, start
     )
-    return jnp.where(flip, 1.0 / omega, omega), done
+    return jnp.where(flip, 1.0 / omega, omega), ended & complete

@@ -1,17 +1,17 @@
 """Frequency responses of one system at many frequencies, with their first two derivatives.
 
-The state matrix is factorised once; each frequency then costs O(n) (modal form) or O(n^2) (Schur
-form) instead of one LU factorisation.
+The state matrix is factorised once; each frequency then costs O(n) (modal form) or, with LAPACK's
+Schur form, O(n^2) instead of one LU factorisation.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
 from lpvid._types import Scalar
+from lpvid.analysis._eigensolvers import AbstractEigensolver
 
 
 class Modal(NamedTuple):
@@ -25,13 +25,14 @@ class Modal(NamedTuple):
     conditioning: Scalar
 
 
-class Triangular(NamedTuple):
-    """Complex Schur form: exists for every matrix, defective ones included."""
+class Reduced(NamedTuple):
+    """G(s) = D + C (s - T)^-1 B in unitary coordinates: exists for defective matrices too."""
 
     T: Complex[Array, "nx nx"]
     B: Complex[Array, "nx nu"]
     C: Complex[Array, "ny nx"]
     D: Float[Array, "ny nu"]
+    eigensolver: AbstractEigensolver
 
 
 def reciprocal(value: Complex[Array, "..."]) -> Complex[Array, "..."]:
@@ -46,10 +47,11 @@ def modal_form(
     B: Float[Array, "nx nu"],
     C: Float[Array, "ny nx"],
     D: Float[Array, "ny nu"],
+    eigensolver: AbstractEigensolver,
 ) -> Modal:
     """Diagonalise A. Where it is defective the result is garbage and `conditioning` is huge."""
     nx = A.shape[0]
-    poles, vectors = jnp.linalg.eig(A)
+    poles, vectors = eigensolver.eigenvectors(A)
     # An exactly singular eigenvector matrix gives infinities, which `trustworthy` refuses.
     inputs = jnp.linalg.solve(vectors, B.astype(vectors.dtype))
     outputs = (C.astype(vectors.dtype) @ vectors).T
@@ -61,15 +63,16 @@ def modal_form(
     return Modal(poles, inputs, outputs, residues, D, conditioning)
 
 
-def triangular_form(
+def reduced_form(
     A: Float[Array, "nx nx"],
     B: Float[Array, "nx nu"],
     C: Float[Array, "ny nx"],
     D: Float[Array, "ny nu"],
-) -> Triangular:
-    """Reduce A to complex Schur form."""
-    T, Q = jsl.schur(A, output="complex")
-    return Triangular(T, Q.conj().T @ B.astype(T.dtype), C.astype(T.dtype) @ Q, D)
+    eigensolver: AbstractEigensolver,
+) -> Reduced:
+    """Reduce A once to what the eigensolver solves with."""
+    T, Q = eigensolver.reduce(A)
+    return Reduced(T, Q.conj().T @ B.astype(T.dtype), C.astype(T.dtype) @ Q, D, eigensolver)
 
 
 def jets(
@@ -85,7 +88,7 @@ def jets(
 
 
 def response(
-    form: Modal | Triangular, omega: Float[Array, " frequency"]
+    form: Modal | Reduced, omega: Float[Array, " frequency"]
 ) -> Complex[Array, "frequency ny nu"]:
     """G(j omega)."""
     ny, nu = form.D.shape
@@ -100,7 +103,7 @@ def response(
         shift = omega[:, None, None] * jnp.eye(nx)[None]
         pencils = lax.complex(jnp.zeros_like(shift), shift) - form.T[None]
         inputs = jnp.broadcast_to(form.B, (count, nx, nu))
-        varying = form.C[None] @ jsl.solve_triangular(pencils, inputs)
+        varying = form.C[None] @ form.eigensolver.solve(pencils, inputs)
     return varying + form.D[None].astype(varying.dtype)
 
 

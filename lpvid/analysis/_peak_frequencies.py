@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from lpvid.analysis._eigensolvers import AbstractEigensolver, default_eigensolver
 from lpvid.analysis._hinf import (
     candidates,
     check_system,
@@ -16,10 +17,10 @@ from lpvid.analysis._hinf import (
 )
 from lpvid.analysis._modal import (
     modal_form,
+    reduced_form,
     refine_peaks,
     response,
     squared_gain,
-    triangular_form,
     trustworthy,
 )
 from lpvid.models import StateSpace
@@ -63,19 +64,20 @@ def peak_frequencies(
     matrices = lax.stop_gradient((system.A, system.B, system.C, system.D))
     batch = system.A.shape[:-2]
     flat = tuple(m.reshape(-1, *m.shape[-2:]) for m in matrices)
-    omega, gain = _batched(flat, system.dt, count)
+    omega, gain = _batched(flat, system.dt, count, default_eigensolver())
     return omega.reshape(*batch, count), gain.reshape(*batch, count)
 
 
-@partial(jax.jit, static_argnums=(1, 2))
-def _batched(matrices, dt: float, count: int):
-    return jax.vmap(partial(_single, dt=dt, count=count))(*matrices)
+@partial(jax.jit, static_argnums=(1, 2, 3))
+def _batched(matrices, dt: float, count: int, eigensolver: AbstractEigensolver):
+    single = partial(_single, dt=dt, count=count, eigensolver=eigensolver)
+    return jax.vmap(single)(*matrices)
 
 
-def _single(A, B, C, D, *, dt: float, count: int):
+def _single(A, B, C, D, *, dt: float, count: int, eigensolver: AbstractEigensolver):
     continuous, unit = to_normalised_continuous(A, B, C, D, dt=dt)
-    form = modal_form(*continuous)
-    top, _ = largest_peak(form, continuous, jnp.array(True), 1e-10)
+    form = modal_form(*continuous, eigensolver)
+    top, _ = largest_peak(form, continuous, jnp.array(True), 1e-10, eigensolver)
     omega, width = candidates(form)
     ordered = jnp.sort(omega)
     middle = 0.5 * (ordered[1:] + ordered[:-1])
@@ -84,7 +86,10 @@ def _single(A, B, C, D, *, dt: float, count: int):
     omega, squared = lax.cond(
         trustworthy(form),
         lambda start: refine_peaks(form, start[0], start[1], 12),
-        lambda start: (start[0], squared_gain(response(triangular_form(*continuous), start[0]))),
+        lambda start: (
+            start[0],
+            squared_gain(response(reduced_form(*continuous, eigensolver), start[0])),
+        ),
         (omega, width),
     )
     if dt > 0.0:
