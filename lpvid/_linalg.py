@@ -154,6 +154,40 @@ def continuous_lyapunov(
     return continuous_sylvester(A, A.mT, Q)
 
 
+def _excess(rates: Array) -> Array:
+    edge, size = jnp.max(rates.real, axis=-1), jnp.abs(rates)
+    # A margin of a tenth of the usual rate: on the very edge a Gramian is all one mode.
+    size = jnp.maximum(size, 1e-3 * jnp.max(size, axis=-1, keepdims=True) + jnp.finfo(float).tiny)
+    margin = 0.1 * jnp.exp(jnp.mean(jnp.log(size), axis=-1))
+    stable = edge < -1e-3 * jnp.max(size, axis=-1)
+    return lax.stop_gradient(jnp.where(stable, 0.0, edge + margin))
+
+
+def excess_growth(A: Float[Array, "*batch n n"]) -> Float[Array, "*batch"]:
+    """α ≥ 0 such that A − αI is Hurwitz stable with a margin; 0 where A itself is.
+
+    Gramians of a model shifted so exist for an unstable one too, and a change of basis found from
+    them is one of the model. A constant to derivatives.
+
+    Args:
+        A: square matrix.
+    """
+    return _excess(jnp.linalg.eigvals(lax.stop_gradient(A)))
+
+
+def excess_radius(A: Float[Array, "*batch n n"]) -> Float[Array, "*batch"]:
+    """ρ ≥ 1 such that A/ρ is Schur stable, with a margin; 1 where A itself is.
+
+    Args:
+        A: square matrix.
+    """
+    poles = jnp.linalg.eigvals(lax.stop_gradient(A))
+    # A pole at zero (a delay) is as fast as can be; its rate is not finite.
+    fast = jnp.abs(poles) > 1e-6
+    rates = jnp.log(jnp.where(fast, poles, 1e-6))
+    return jnp.exp(_excess(rates))
+
+
 def _structured_doubling(A: Array, G: Array, H: Array) -> Array:
     """X = Aᵀ X (I + G X)⁻¹ A + H for H and G positive semidefinite, by doubling; NaN in failure."""
     identity = jnp.eye(A.shape[0])

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from lpvid._results import Status
 from lpvid.analysis import parameter_fit
@@ -13,8 +14,17 @@ from lpvid.interpolate import (
     interpolate_balanced,
     interpolation_fit,
     leave_one_out,
+    left_out_error,
 )
-from lpvid.models import FreeStructure, ModalStructure, Polynomial, StateSpace
+from lpvid.interpolate._leave_one_out import left_out
+from lpvid.models import (
+    FreeStructure,
+    ModalStructure,
+    Polynomial,
+    Spline,
+    StateSpace,
+    StructuredModel,
+)
 from lpvid.restructure import Restructured
 
 KAPPAS = np.linspace(-1.0, 2.0, 7)
@@ -129,6 +139,118 @@ def test_leaving_one_out_stops_at_degrees_that_the_rest_cannot_tell():
     assert list(leave_one_out(LOCAL[:4], KAPPAS[:4], highest=1)) == [0, 1]
 
 
+def covariances_of(count, width, seed=7):
+    """Full covariances of parameters of very different sizes, one point far better known."""
+    rng = np.random.default_rng(seed)
+    factors = rng.normal(size=(count, width, width)) * 10.0 ** rng.uniform(-2, 2, size=width)
+    factors[2] *= 1e-2
+    return factors @ np.moveaxis(factors, 1, 2)
+
+
+def test_full_covariances_give_generalised_least_squares():
+    rows = RNG.normal(size=(7, 4))
+    local = [StructuredModel(FreeStructure(1, 1, 1), row) for row in rows]
+    covariances = covariances_of(7, 4)
+    lpv = interpolate(local, KAPPAS, Polynomial(degree=2), covariances=covariances)
+    design = np.kron(np.polynomial.polynomial.polyvander(KAPPAS, 2), np.eye(4))
+    information = np.zeros((28, 28))
+    for k in range(7):
+        information[4 * k : 4 * k + 4, 4 * k : 4 * k + 4] = np.linalg.inv(covariances[k])
+    normal = design.T @ information @ design
+    expected = np.linalg.solve(normal, design.T @ information @ rows.reshape(-1)).reshape(3, 4)
+    fitted = np.polynomial.polynomial.polyval(KAPPAS, expected).T
+    np.testing.assert_allclose(lpv.parameters(KAPPAS), fitted, rtol=1e-6, atol=1e-8)
+
+
+def test_equal_variances_and_fixed_parameters_count_as_without_weights():
+    rows = RNG.normal(size=(7, 4))
+    local = [StructuredModel(FreeStructure(1, 1, 1), row) for row in rows]
+    # The third parameter was fixed everywhere, and not told by the records at one point.
+    covariances = np.tile(np.diag([1e-4, 4.0, 0.0, 1e-10]), (7, 1, 1))
+    found = interpolate(local, KAPPAS, Polynomial(1), covariances=list(covariances))
+    expected = interpolate(local, KAPPAS, Polynomial(1))
+    np.testing.assert_allclose(found.coefficients, expected.coefficients, rtol=1e-9, atol=1e-12)
+
+    @jax.jit
+    @jax.grad
+    def slope(scale):
+        lpv = interpolate(local, KAPPAS, Polynomial(1), covariances=scale * covariances)
+        return jnp.sum(lpv.coefficients**2)
+
+    # One factor for all changes nothing; repeated eigenvalues leave the derivative finite.
+    np.testing.assert_allclose(slope(3.0), 0.0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_covariances_bring_the_curve_nearer_to_the_truth():
+    """Points known to different precision: the weighted curve is better, in most of 20 draws."""
+    covariances = 1e-4 * covariances_of(7, 4)
+    factors = np.linalg.cholesky(covariances)
+    truth = np.polynomial.polynomial.polyval(KAPPAS, RNG.normal(size=(3, 4))).T
+    mean_square = np.zeros(2)
+    for seed in range(20):
+        noise = np.random.default_rng(seed).normal(size=(7, 4, 1))
+        rows = truth + (factors @ noise)[..., 0]
+        local = [StructuredModel(FreeStructure(1, 1, 1), row) for row in rows]
+        for place, options in enumerate(({"covariances": covariances}, {})):
+            lpv = interpolate(local, KAPPAS, Polynomial(2), **options)
+            errors = np.asarray(lpv.parameters(KAPPAS)) - truth
+            mean_square[place] += np.sum(errors**2 / covariances.mean(axis=0).diagonal())
+    assert mean_square[0] < mean_square[1]
+
+
+@pytest.mark.slow
+def test_a_point_without_weight_neither_bends_nor_judges_the_curve():
+    rows = polynomial(1, seed=4)(KAPPAS)
+    rows[3] += 0.5
+    local = [restructured(STRUCTURE, row) for row in rows]
+    weights = np.ones(7)
+    weights[3] = 1e-14
+    errors = leave_one_out(local, KAPPAS, highest=2, weights=weights)
+    assert errors[0] > 0.01 and errors[1] < 1e-5
+    assert leave_one_out(local, KAPPAS, highest=1)[1] > 0.05
+    covariances = 1e-6 * np.eye(12) / weights[:, None, None]
+    errors = leave_one_out(local, KAPPAS, highest=2, covariances=covariances)
+    assert errors[0] > 0.01 and errors[1] < 1e-4
+
+
+def test_edges_of_a_grid_may_be_left_out_its_corners_not():
+    grid = np.stack(np.meshgrid([0.0, 1.0, 2.0], [0.0, 1.0, 2.0]), axis=-1).reshape(9, 2)
+    np.testing.assert_array_equal(left_out(grid), [1, 3, 4, 5, 7])
+    np.testing.assert_array_equal(left_out(KAPPAS[:, None]), [1, 2, 3, 4, 5])
+
+
+def test_splines_pass_through_the_points_and_follow_what_polynomials_cannot():
+    rows = QUADRATIC(KAPPAS) + 0.3 * np.abs(KAPPAS)[:, None]
+    local = [restructured(STRUCTURE, row) for row in rows]
+    lpv = interpolate(local, KAPPAS, Spline())
+    np.testing.assert_allclose(lpv.parameters(KAPPAS), rows, atol=1e-9)
+    between = np.linspace(-1.0, 2.0, 20)
+    expected = CubicSpline(KAPPAS, rows, bc_type="natural")(between)
+    np.testing.assert_allclose(lpv.parameters(between), expected, atol=1e-9)
+    error = left_out_error(local, KAPPAS, Spline())
+    assert error < left_out_error(local, KAPPAS, Polynomial(1))
+    with pytest.raises(ValueError, match="do not determine"):
+        left_out_error(local, KAPPAS, Polynomial(6))
+
+
+def test_discrete_models_give_a_discrete_model():
+    models = [model.discretise(0.1) for model in FREE]
+    lpv = interpolate(models, [0, 1, 2], Polynomial(2))
+    assert lpv.dt == 0.1
+    np.testing.assert_allclose(lpv.at(1.0).A, models[1].A, rtol=1e-12)
+    u = RNG.normal(size=8)
+    expected = models[1].simulate(u=u)
+    np.testing.assert_allclose(lpv.simulate(u=u, kappa=np.ones(8)), expected, atol=1e-12)
+    assert left_out_error(models, [0, 1, 2], Polynomial(1)) < 0.1
+
+
+def test_the_hull_of_the_points_is_kept():
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    lpv = interpolate(FREE, points, Polynomial(1))
+    np.testing.assert_array_equal(lpv.is_inside([[0.3, 0.3], [0.9, 0.9]]), [True, False])
+
+
 def balanced_family():
     """A family that has coherent balanced bases, seen through random ones."""
     models = []
@@ -184,9 +306,9 @@ FREE = [StateSpace(-np.eye(1) * k, np.ones((1, 1)), np.ones((1, 1))) for k in (1
     [
         ([], [], {}, "models: none given"),
         (LOCAL, KAPPAS[:-1], {}, "kappas: one row for each of the 7 models"),
-        (LOCAL[:2], KAPPAS[:2], {}, "degree: 2 needs 3 distinct points"),
-        (LOCAL[:3], [0.0, 0.0, 1.0], {}, "degree: 2 needs 3 distinct points"),
-        (FREE, [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]], {"method": Polynomial(1)}, "not all on"),
+        (LOCAL[:2], KAPPAS[:2], {}, "has 3 functions"),
+        (LOCAL[:3], [0.0, 0.0, 1.0], {}, "has 3 functions"),
+        (FREE, [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]], {"method": Polynomial(1)}, "all on one curve"),
         (LOCAL, KAPPAS, {"weights": np.zeros(7)}, "weights: 7 positive numbers"),
         (LOCAL, KAPPAS, {"weights": np.ones(6)}, "weights: 7 positive numbers"),
         ([*FREE, LOCAL[0]], KAPPAS[:4], {}, "do not mix"),
@@ -202,7 +324,11 @@ FREE = [StateSpace(-np.eye(1) * k, np.ones((1, 1)), np.ones((1, 1))) for k in (1
             {},
             "of one size",
         ),
-        ([m.discretise(0.1) for m in FREE], [0, 1, 2], {}, "continuous-time models"),
+        ([*FREE[:2], FREE[2].discretise(0.1)], [0, 1, 2], {}, "of one size and sample time"),
+        (FREE, [0, 1, 2], {"weights": np.ones(3), "covariances": np.ones((3, 4, 4))}, "not both"),
+        (FREE, [0, 1, 2], {"covariances": np.ones((3, 3, 3))}, r"covariances: one of shape \(4, 4"),
+        (FREE, [0, 1, 2], {"covariances": -np.eye(4) * np.ones((3, 1, 1))}, "point 0 is not fin"),
+        (FREE, [0, 1, 2], {"method": Spline((0.0, 0.5, 1.0, 2.0))}, "has 4 functions"),
         (
             [LOCAL[0], restructured(STRUCTURE, np.full(12, np.nan)), LOCAL[2]],
             [0, 1, 2],

@@ -54,6 +54,48 @@ class TwoLinkArmStructure(AbstractStructure):
         C = jnp.array([[0.0, 0.0, 1.0, 0.0, first, 0.0], [0.0, 0.0, 0.0, 1.0, first, second]])
         return StateSpace(A, B, C)
 
+    @eqx.filter_jit
+    def closed_form(self, black_box: StateSpace) -> Float[Array, "16"]:
+        """ϑ of a black box of order 6, by four conditions on its basis; sensitive to noise.
+
+        With x_𝔵 = S x and S = [S_v, S_θ̇, S_v̇] the structure asks for 𝔄 S_θ̇ = −𝔅, 𝔄 S_v̇ = S_v,
+        ℭ S = C and T_v 𝔅 = 0, where T_v are the first rows of S⁻¹. So S_θ̇ = −𝔄⁻¹𝔅, and S_v̇
+        solves [ℭ; ℭ𝔄] S_v̇ = [C_v; 0] up to a null space that T_v S_v̇ = 0 fixes, T_v lying in the
+        left null space of [𝔅, 𝔄⁻¹𝔅]. Exact on noise-free models; on the reference arm a model
+        3 % off in H∞ gives parameters off by factors of 2 to 20. Works under `jit` and `vmap`.
+
+        Args:
+            black_box: continuous-time model of order 6 with a regular A.
+
+        Raises:
+            ValueError: the black box is not in continuous time, or of another size.
+
+        Example:
+            >>> structure = TwoLinkArmStructure((0.35, 0.30))
+            >>> arm = structure.matrices(DissipativeTwoLinkArm((0.35, 0.30)).entries(jnp.ones(14)))
+            >>> structure.closed_form(arm.transform(jnp.eye(6)[::-1])).shape
+            (16,)
+        """
+        sizes = (black_box.nx, black_box.nu, black_box.ny, black_box.dt)
+        if sizes != (6, 2, 2, 0.0):
+            raise ValueError(
+                "black_box: (nx, nu, ny, dt) = (6, 2, 2, 0) is needed for the closed form, got "
+                f"{sizes}; identify with order=6 and convert with d2c."
+            )
+        A, B, C = black_box.A, black_box.B, black_box.C
+        first, second = self.lengths
+        deflections = jnp.array([[first, 0.0], [first, second], [0.0, 0.0], [0.0, 0.0]])
+        rates = -jnp.linalg.solve(A, B)
+        conditions = jnp.concatenate([C, C @ A])
+        particular = jnp.linalg.pinv(conditions) @ deflections
+        null = jnp.linalg.svd(conditions)[2][4:].T
+        left = jnp.linalg.svd(jnp.concatenate([B, rates], axis=1).T)[2][4:]
+        velocities = particular - null @ jnp.linalg.solve(left @ null, left @ particular)
+        S = jnp.concatenate([A @ velocities, rates, velocities], axis=1)
+        # Columns of A S beside those of −B, which are the same ones here.
+        columns = jnp.linalg.solve(S, A @ S[:, :4])
+        return columns[2:6].T.reshape(16)
+
     def search_structure(self) -> "DissipativeTwoLinkArm":
         """The dissipative form, in which every parameter value is a stable model."""
         return DissipativeTwoLinkArm(self.lengths, self.scales)

@@ -31,17 +31,23 @@ def _control() -> Any:
 
 
 def to_control(system: StateSpace) -> Any:
-    """The model as a `control.StateSpace`.
+    """The model as a `control.StateSpace`; a batch, as `lpv.at(kappas)`, as a list of them.
+
+    Args:
+        system: a model; with one batch axis for a list, with more for a list of lists.
 
     Raises:
         ImportError: python-control is not installed.
-        ValueError: the model has batch axes.
+        ValueError: the model holds traced values.
 
     Example:
         >>> from lpvid.models import StateSpace, to_control
         >>> float(to_control(StateSpace([[-1.0]], [[1.0]], [[2.0]])).dcgain())  # doctest: +SKIP
         2.0
     """
+    if system.batch_shape:
+        blocks = zip(system.A, system.B, system.C, system.D, strict=True)
+        return [to_control(StateSpace(*each, dt=system.dt)) for each in blocks]
     return _control().ss(*_matrices(system), system.dt)
 
 

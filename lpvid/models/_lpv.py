@@ -1,5 +1,6 @@
 """Linear parameter-varying models: a structure whose parameters depend on the scheduling."""
 
+import math
 import warnings
 
 import equinox as eqx
@@ -9,8 +10,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from lpvid.models._convert import c2d
-from lpvid.models._scheduling import PolynomialBasis
+from lpvid._linalg import batched
+from lpvid.models._connected import SampledStructure
+from lpvid.models._hold import AbstractConversion, ZeroOrderHold
+from lpvid.models._hull import ConvexHull
+from lpvid.models._schedule_hold import AbstractScheduleHold, HeldSchedule
+from lpvid.models._scheduling import AbstractBasis
 from lpvid.models._simulate import simulate_time_varying
 from lpvid.models._state_space import Numbers, StateSpace
 from lpvid.models._structures import AbstractStructure
@@ -21,15 +26,22 @@ class LPVStateSpace(eqx.Module):
 
     ϑ(κ) is a linear combination of basis functions of the scheduling variable κ. With a
     `FreeStructure`, or any structure affine in ϑ, the matrices themselves are polynomials in κ
-    (001, equation 35).
+    (001, equation 35). In discrete time (`discretise`, or a structure in discrete time) x(t + 1)
+    takes the place of ẋ.
+
+    Models are connected with each other and with LTI models by `series`, `parallel` and `feedback`.
 
     Attributes:
-        structure: ϑ → (A, B, C, D), in continuous time.
+        structure: ϑ → (A, B, C, D).
         basis: functions of κ.
         coefficients: shape (basis.size, structure.n_parameters).
         kappa_low: lower end of each scheduling variable's range at the points that the model was
             built from.
         kappa_high: its upper end.
+        hull: the convex hull of those points; the box of the ranges where it is left out.
+
+    Raises:
+        ValueError: the coefficients' shape is not (basis.size, structure.n_parameters).
 
     Example:
         >>> structure = FreeStructure(n_states=1, n_inputs=1, n_outputs=1, feedthrough=False)
@@ -43,98 +55,191 @@ class LPVStateSpace(eqx.Module):
     """
 
     structure: AbstractStructure
-    basis: PolynomialBasis
+    basis: AbstractBasis
     coefficients: Float[Array, "basis parameter"]
     kappa_low: Float[Array, " scheduling"]
     kappa_high: Float[Array, " scheduling"]
+    hull: ConvexHull | None = None
+
+    def __check_init__(self):
+        wanted = (self.basis.size, self.structure.n_parameters)
+        found = getattr(self.coefficients, "shape", wanted)
+        if found != wanted:
+            raise ValueError(
+                f"coefficients: one row for each basis function and one column for each parameter "
+                f"are needed, {wanted}; got shape {found}."
+            )
 
     @property
     def n_scheduling(self) -> int:
         """Number of scheduling variables."""
         return self.kappa_low.shape[0]
 
+    @property
+    def _form(self) -> StateSpace:
+        """A frozen model's sizes and sample time, worked out from shapes alone."""
+        return jax.eval_shape(self.structure.matrices, self.coefficients[0])
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return self._form.nx
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return self._form.nu
+
+    @property
+    def ny(self) -> int:
+        """Number of outputs."""
+        return self._form.ny
+
+    @property
+    def dt(self) -> float:
+        """Sample time in seconds; 0 in continuous time."""
+        return self._form.dt
+
     def parameters(self, kappa: Numbers) -> Float[Array, "*batch parameter"]:
         """ϑ(κ) for κ of shape (…, n_scheduling); a scalar κ may be given plainly."""
         return self.basis(self._schedule(kappa)) @ self.coefficients
 
     def at(self, kappa: Numbers) -> StateSpace:
-        """The continuous-time model frozen at one value of κ; warns outside its range.
+        """The model frozen at κ; warns where that is outside of the points' hull.
+
+        Args:
+            kappa: shape (n_scheduling,), or (…, n_scheduling) for a batch of models; with one
+                scheduling variable a number, or the batch's shape alone.
+
+        Returns:
+            The frozen model, its batch axes those of κ.
 
         Raises:
-            ValueError: κ is not one point.
+            ValueError: the last axis of κ does not hold the scheduling variables.
         """
         point = self._schedule(kappa)
-        if point.ndim != 1:
-            raise ValueError(
-                f"kappa: one point of {self.n_scheduling} values is needed, got shape "
-                f"{point.shape}; use jax.vmap(lpv.at) for several."
-            )
         self._warn_outside(point)
-        return self.structure.matrices(self.parameters(point))
+        return self._frozen(point)
+
+    def _frozen(self, point: Array) -> StateSpace:
+        if point.ndim == 1:
+            return self.structure.matrices(self.parameters(point))
+        batch = point.shape[:-1]
+        flat = self.parameters(point.reshape(-1, self.n_scheduling))
+        frozen = jax.vmap(self.structure.matrices)(flat)
+        return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), frozen)
 
     def is_stable(self, kappa: Numbers) -> Array:
         """Whether the frozen model is stable at κ, shape (…, n_scheduling) → (…).
 
         Stable local models do not make the models between them stable, unless the structure
-        does (modal, mechanical).
+        does (modal, mechanical); nor do stable frozen models make a moving one stable.
         """
-        point = self._schedule(kappa)
-        flat = point.reshape(-1, self.n_scheduling)
-        frozen = jax.vmap(self.structure.matrices)(self.parameters(flat))
-        return frozen.is_stable().reshape(point.shape[:-1])
+        return self._frozen(self._schedule(kappa)).is_stable()
 
     def is_inside(self, kappa: Numbers) -> Array:
-        """Whether κ (…, n_scheduling) lies within the box of the points it was built from."""
+        """Whether κ (…, n_scheduling) lies within the hull of the points it was built from."""
         point = self._schedule(kappa)
         # A hair outside, as of a measured schedule at the end of its range, is no extrapolation.
+        if self.hull is not None:
+            return self.hull.distance(point) <= 2e-3
         slack = 1e-3 * (self.kappa_high - self.kappa_low)
         low = jnp.broadcast_to(self.kappa_low - slack, point.shape)
         high = jnp.broadcast_to(self.kappa_high + slack, point.shape)
         return jnp.all(((point - low) >= 0) & ((high - point) >= 0), axis=-1)
 
-    def simulate(
-        self, *, u: Numbers, kappa: Numbers, dt: float, x0: Numbers | None = None
-    ) -> Float[Array, "time output"]:
-        """Response to an input along a schedule.
+    def discretise(self, dt: float, method: AbstractConversion | None = None) -> "LPVStateSpace":
+        """The LPV model in discrete time, each frozen model discretised (zero-order hold).
 
-        Input and scheduling are held constant over each sample, for which the frozen model is
-        discretised exactly. Works under `jit` and `vmap`, forward and reverse derivatives in the
-        coefficients, u, κ and x0. Warns where κ leaves the range of the model (outside `jit`).
+        So κ is held over each sample, as in `simulate` with `HeldSchedule`.
 
         Args:
-            u: input (time, n_inputs), or (time,) for one input.
-            kappa: schedule (time, n_scheduling), or (time,) for one scheduling variable.
             dt: sample time, s.
-            x0: first state, zero by default.
-
-        Returns:
-            Output (time, n_outputs).
+            method: `ZeroOrderHold()` by default, or `Tustin()`.
 
         Raises:
-            ValueError: shapes do not fit.
+            ValueError: the model is in discrete time already, or dt is not positive.
+
+        Example:
+            >>> from lpvid.models import FreeStructure, LPVStateSpace, polynomial_basis
+            >>> free, basis = FreeStructure(1, 1, 1, feedthrough=False), polynomial_basis([0.0], 0)
+            >>> lpv = LPVStateSpace(free, basis, -jnp.ones((1, 3)), jnp.zeros(1), jnp.ones(1))
+            >>> lpv.discretise(0.1).at(0.5).A.round(3).item()
+            0.905
+        """
+        if self.dt > 0.0:
+            raise ValueError(f"The model is in discrete time already (dt = {self.dt} s).")
+        if not (float(dt) > 0.0 and math.isfinite(dt)):
+            raise ValueError(f"dt is {dt}; the sample time must be a positive number of seconds.")
+        method = ZeroOrderHold() if method is None else method
+        return LPVStateSpace(
+            SampledStructure(self.structure, method, float(dt)),
+            self.basis,
+            self.coefficients,
+            self.kappa_low,
+            self.kappa_high,
+            self.hull,
+        )
+
+    def simulate(
+        self,
+        *,
+        u: Numbers,
+        kappa: Numbers,
+        dt: float | None = None,
+        x0: Numbers | None = None,
+        hold: AbstractScheduleHold | None = None,
+    ) -> Float[Array, "*batch time output"]:
+        """Response to an input along a schedule.
+
+        The input is held constant over each sample; so is the scheduling, unless `hold` says
+        otherwise. Works under `jit` and `vmap`, forward and reverse derivatives in the
+        coefficients, u, κ and x0. Warns where κ leaves the hull of the model (outside `jit`).
+
+        Args:
+            u: input (time, n_inputs), or (time,) for one input; leading axes are a batch.
+            kappa: schedule (time, n_scheduling), or (time,) for one scheduling variable; leading
+                axes are a batch.
+            dt: sample time, s; of a discrete-time model its own, and may be left out.
+            x0: first state (n_states,), leading axes are a batch; zero by default.
+            hold: `HeldSchedule()` by default, or `LinearSchedule(substeps)`; not for discrete time.
+
+        Returns:
+            Output (time, n_outputs), with the batch axes of u, κ and x0, broadcast, in front.
+
+        Raises:
+            ValueError: shapes do not fit, the sample time is missing or contradicts the model's, or
+                a discrete-time model is given a `hold`.
         """
         u = jnp.asarray(u, float)
         u = u[:, None] if u.ndim == 1 else u
         schedule = self._schedule(kappa)
-        if schedule.shape[0] != u.shape[0] or schedule.ndim != 2:
+        if schedule.ndim < 2 or schedule.shape[-2] != u.shape[-2]:
             raise ValueError(
-                f"kappa: {u.shape[0]} samples of {self.n_scheduling} values are needed, one for "
+                f"kappa: {u.shape[-2]} samples of {self.n_scheduling} values are needed, one for "
                 f"each sample of u; got shape {schedule.shape}."
             )
+        form = self._form
+        if form.nu != u.shape[-1]:
+            raise ValueError(f"u: {form.nu} inputs are needed, got {u.shape[-1]} columns.")
+        start = jnp.zeros(form.nx) if x0 is None else jnp.asarray(x0, float)
+        if start.shape[-1:] != (form.nx,):
+            raise ValueError(f"x0: {form.nx} states are needed, got shape {start.shape}.")
+        if form.is_discrete and hold is not None:
+            raise ValueError("hold: a discrete-time model knows κ at its samples only; leave out.")
+        sample_time = _sample_time(form.dt, dt)
         self._warn_outside(schedule)
-        return self._simulate(u, schedule, float(dt), x0)
+        hold = HeldSchedule() if hold is None else hold
+        return self._simulate(u, schedule, sample_time, start, hold)
 
     @eqx.filter_jit
-    def _simulate(self, u, schedule, dt, x0):
-        frozen = jax.vmap(self.structure.matrices)(self.parameters(schedule))
-        if frozen.nu != u.shape[1]:
-            raise ValueError(f"u: {frozen.nu} inputs are needed, got {u.shape[1]} columns.")
-        # Batched, not vmapped: so the matrix exponential skips the squarings that no sample needs.
-        discrete = c2d(frozen, dt)
-        start = jnp.zeros(frozen.nx) if x0 is None else jnp.asarray(x0, float)
-        if start.shape != (frozen.nx,):
-            raise ValueError(f"x0: {frozen.nx} states are needed, got shape {start.shape}.")
-        return simulate_time_varying(discrete.A, discrete.B, discrete.C, discrete.D, u=u, x0=start)
+    def _simulate(self, u, schedule, dt, start, hold):
+        frozen = self._frozen(schedule)
+        A, B = frozen.A, frozen.B
+        if not frozen.is_discrete:
+            A, B = hold.transitions(self._frozen, schedule, dt)
+        run = batched(_run, "(t,n,n),(t,n,m),(t,p,n),(t,p,m),(t,m),(n)->(t,p)")
+        return run(A, B, frozen.C, frozen.D, u, start)
 
     def _schedule(self, kappa: Numbers) -> Array:
         """κ with a last axis of n_scheduling; a missing axis is added where that is no guess."""
@@ -153,9 +258,27 @@ class LPVStateSpace(eqx.Module):
             return
         share = float(np.mean(~np.asarray(self.is_inside(point))))
         if share > 0:
+            flat = self.n_scheduling == 1 or self.hull is None
             warnings.warn(
-                f"kappa: {100 * share:.3g} % of the points lie outside the range "
+                f"kappa: {100 * share:.3g} % of the points lie outside the "
+                f"{'range' if flat else 'convex hull of the points in the range'} "
                 f"{np.asarray(self.kappa_low)} to {np.asarray(self.kappa_high)} that the model was "
                 "built from; it extrapolates there.",
                 stacklevel=3,
             )
+
+
+def _sample_time(own: float, given: float | None) -> float:
+    if own > 0.0:
+        if given is not None and not math.isclose(given, own, rel_tol=1e-9):
+            raise ValueError(f"dt is {given} s, the model's sample time {own} s; leave dt out.")
+        return own
+    if given is None:
+        raise ValueError("dt: the model is in continuous time; give the sample time of u.")
+    if not (float(given) > 0.0 and math.isfinite(given)):
+        raise ValueError(f"dt is {given}; the sample time must be a positive number of seconds.")
+    return float(given)
+
+
+def _run(A, B, C, D, u, x0):
+    return simulate_time_varying(A, B, C, D, u=u, x0=x0)

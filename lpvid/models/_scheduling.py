@@ -1,5 +1,6 @@
 """Functions of the scheduling variable: the bases that LPV parameters are expanded in."""
 
+import abc
 import itertools
 
 import equinox as eqx
@@ -10,7 +11,28 @@ from jaxtyping import Array, Float
 from lpvid.models._state_space import Numbers
 
 
-class Polynomial(eqx.Module):
+class AbstractBasis(eqx.Module):
+    """Functions of κ, φ(κ): the parameters are their linear combinations."""
+
+    @property
+    @abc.abstractmethod
+    def size(self) -> int:
+        """Number of basis functions."""
+
+    @abc.abstractmethod
+    def __call__(self, kappa: Numbers) -> Float[Array, "*batch basis"]:
+        """Values of all basis functions at κ, shape (…, n_scheduling) → (…, size)."""
+
+
+class AbstractDependence(eqx.Module):
+    """How the parameters depend on κ: the method of `interpolate`."""
+
+    @abc.abstractmethod
+    def basis(self, points: Numbers) -> AbstractBasis:
+        """The basis for local models at these points, shape (n_points, n_scheduling)."""
+
+
+class Polynomial(AbstractDependence):
     """Polynomial dependence on κ, up to a total degree (001, equation 35).
 
     Attributes:
@@ -32,8 +54,18 @@ class Polynomial(eqx.Module):
                 f"degree: a whole number from 0 or 'auto' is needed, got {self.degree!r}."
             )
 
+    def basis(self, points: Numbers) -> "PolynomialBasis":
+        """The monomials up to the degree, centred on the points.
 
-class PolynomialBasis(eqx.Module):
+        Raises:
+            ValueError: the degree is `"auto"`, which only local models can tell.
+        """
+        if self.degree == "auto":
+            raise ValueError("degree: 'auto' is chosen by interpolate; give a number here.")
+        return polynomial_basis(points, int(self.degree))
+
+
+class PolynomialBasis(AbstractBasis):
     """The monomials of κ up to a total degree, in κ centred and scaled to [−1, 1].
 
     Centring keeps the least-squares problem well conditioned.
@@ -66,6 +98,27 @@ class PolynomialBasis(eqx.Module):
             for powers in self.exponents
         ]
         return jnp.stack(columns, axis=-1)
+
+
+class JoinedBasis(AbstractBasis):
+    """The functions of two bases, one after the other: of two LPV models connected to one.
+
+    Attributes:
+        first: of the first model.
+        second: of the second.
+    """
+
+    first: AbstractBasis
+    second: AbstractBasis
+
+    @property
+    def size(self) -> int:
+        """Number of basis functions."""
+        return self.first.size + self.second.size
+
+    def __call__(self, kappa: Numbers) -> Float[Array, "*batch basis"]:
+        """Values of all basis functions at κ, shape (…, n_scheduling) → (…, size)."""
+        return jnp.concatenate([self.first(kappa), self.second(kappa)], axis=-1)
 
 
 def polynomial_basis(kappas: Numbers, degree: int) -> PolynomialBasis:

@@ -65,6 +65,21 @@ class AbstractStructure(eqx.Module):
             "starting vectors) to restructure."
         )
 
+    def closed_form(self, black_box: StateSpace) -> Parameters:
+        """ϑ from a black box in closed form, exact where the structure holds the black box.
+
+        Args:
+            black_box: continuous-time model of the structure's order.
+
+        Raises:
+            ValueError: the structure has no closed form.
+        """
+        del black_box
+        raise ValueError(
+            f"{type(self).__name__} has no closed form: leave ClosedFormStart() out, and take "
+            "SimilarityStarts() instead."
+        )
+
     def search_structure(self) -> "AbstractStructure | None":
         """A better-behaved parameterisation to search in first (None: search in this one)."""
         return None

@@ -34,9 +34,17 @@ def test_transfer_functions_are_realised():
         np.testing.assert_allclose(system.frequency_response(omega)[:, 0, 0], expected)
 
 
+def test_a_batch_becomes_a_list():
+    systems = batch(2, dt=0.02)
+    for index, theirs in enumerate(to_control(systems)):
+        assert theirs.dt == 0.02
+        np.testing.assert_array_equal(theirs.A, systems.A[index])
+        np.testing.assert_array_equal(theirs.D, systems.D[index])
+
+
 def test_faults_are_named(monkeypatch):
     with pytest.raises(ValueError, match="batch axes"):
-        to_control(batch(2))
+        to_scipy(batch(2))
     with pytest.raises(ValueError, match="traced"):
         jax.jit(lambda s: s.A + to_scipy(s).A)(flexible())
     with pytest.raises(ValueError, match="dt is True"):

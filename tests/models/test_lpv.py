@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.signal
 
 from lpvid.models import (
     FreeStructure,
+    LinearSchedule,
     LPVStateSpace,
     ModalStructure,
     StateSpace,
@@ -156,9 +158,82 @@ def test_signals_that_do_not_fit_are_refused(options, message):
         LPV.simulate(**({"u": U, "kappa": KAPPA, "dt": DT} | options))
 
 
-def test_freezing_needs_one_point():
-    with pytest.raises(ValueError, match="use jax.vmap"):
-        LPV.at([0.1, 0.2])
+def test_many_points_give_a_batch_of_frozen_models():
+    points = np.array([[0.1, 0.2, 0.9], [0.4, 0.5, 0.6]])
+    frozen = LPV.at(points)
+    assert frozen.batch_shape == (2, 3)
+    np.testing.assert_allclose(frozen.C[1, 2], LPV.at(0.6).C, rtol=1e-12)
+    assert LPV.is_stable(points).shape == (2, 3)
+    assert (LPV.nx, LPV.nu, LPV.ny, LPV.dt) == (4, 2, 2, 0.0)
+
+
+def test_inputs_schedules_and_first_states_may_be_batches():
+    schedules = np.stack([KAPPA, KAPPA[::-1], np.full(LENGTH, 0.7)])
+    x0 = RNG.normal(size=(3, 4))
+    y = LPV.simulate(u=U, kappa=schedules, dt=DT, x0=x0)
+    assert y.shape == (3, LENGTH, 2)
+    for k in range(3):
+        expected = recursion(LPV, U, schedules[k], x0[k])
+        np.testing.assert_allclose(y[k], expected, rtol=1e-9, atol=1e-9)
+    inputs = np.stack([U, 2.0 * U])[:, None]
+    y = LPV.simulate(u=inputs, kappa=schedules, dt=DT)
+    assert y.shape == (2, 3, LENGTH, 2)
+    np.testing.assert_allclose(y[1], 2.0 * np.asarray(y[0]), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(y[0, 0], LPV.simulate(u=U, kappa=KAPPA, dt=DT), atol=1e-12)
+
+
+def test_a_discretised_model_is_the_recursion_too():
+    discrete = LPV.discretise(DT)
+    assert discrete.dt == DT
+    np.testing.assert_allclose(discrete.at(0.3).A, LPV.at(0.3).discretise(DT).A, rtol=1e-12)
+    y = discrete.simulate(u=U, kappa=KAPPA)
+    np.testing.assert_allclose(y, LPV.simulate(u=U, kappa=KAPPA, dt=DT), rtol=1e-9, atol=1e-12)
+    with pytest.raises(ValueError, match="in discrete time already"):
+        discrete.discretise(DT)
+    with pytest.raises(ValueError, match="leave dt out"):
+        discrete.simulate(u=U, kappa=KAPPA, dt=2 * DT)
+    with pytest.raises(ValueError, match="hold: a discrete-time model"):
+        discrete.simulate(u=U, kappa=KAPPA, hold=LinearSchedule())
+    with pytest.raises(ValueError, match="give the sample time"):
+        LPV.simulate(u=U, kappa=KAPPA)
+    with pytest.raises(ValueError, match="substeps: one at least"):
+        LinearSchedule(substeps=0)
+
+
+# Long samples, so that the way κ takes between them matters.
+COARSE = 0.05
+
+
+def integrated(lpv, u, kappa, dt):
+    """ẋ = A(κ(t)) x + B(κ(t)) u with κ on straight lines between samples, by SciPy."""
+    x, outputs = np.zeros(4), []
+    matrices = jax.jit(lambda k: lpv.structure.matrices(lpv.parameters(k)))
+    for t in range(len(u)):
+        frozen = matrices(kappa[t])
+        outputs.append(frozen.C @ x + frozen.D @ u[t])
+        step = kappa[t + 1] - kappa[t] if t + 1 < len(u) else 0.0
+
+        def rate(time, x, t=t, step=step):
+            frozen = matrices(kappa[t] + step * time / dt)
+            return frozen.A @ x + frozen.B @ u[t]
+
+        x = scipy.integrate.solve_ivp(rate, (0.0, dt), x, rtol=1e-10, atol=1e-12).y[:, -1]
+    return np.stack(outputs)
+
+
+@pytest.mark.slow
+def test_a_linear_schedule_is_the_differential_equation_to_fourth_order():
+    u, kappa = U[:8], KAPPA[:32:4]
+    expected = integrated(LPV, u, kappa, COARSE)
+    held = LPV.simulate(u=u, kappa=kappa, dt=COARSE)
+    one, two, eight = (
+        LPV.simulate(u=u, kappa=kappa, dt=COARSE, hold=LinearSchedule(substeps))
+        for substeps in (1, 2, 8)
+    )
+    errors = [np.abs(np.asarray(y) - expected).max() for y in (held, one, two, eight)]
+    assert errors[3] < 1e-5 * errors[0]
+    # Between one and two substeps an error of fourth order falls by 16.
+    assert errors[2] < errors[1] / 8.0
 
 
 def test_one_dimensional_input_is_one_channel():
