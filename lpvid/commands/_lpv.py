@@ -1,4 +1,4 @@
-"""`lpvid lpv`: local models at operating points, restructured, interpolated, tested."""
+"""`lpvid lpv`: local models at operating points, restructured, interpolated, refined, tested."""
 
 import argparse
 import itertools
@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from lpvid import __version__
 from lpvid._results import Status, is_successful
@@ -15,19 +16,21 @@ from lpvid.analysis import hinf_norm
 from lpvid.commands._cache import keep_compiled_code
 from lpvid.commands._errors import UsageError
 from lpvid.commands._identify import poles_of
+from lpvid.commands._lpv_arguments import check, groups_of, numbers
+from lpvid.commands._lpv_refine import refine_all
 from lpvid.commands._lpv_tables import print_all, written
 from lpvid.commands._messages import Warnings, say
-from lpvid.commands._output import check_targets, write_json
+from lpvid.commands._output import write_json
 from lpvid.commands._records import (
-    check_columns,
     offsets_of,
     read_records,
     subspace_method,
     without_offsets,
+    without_rest,
 )
 from lpvid.data import IOData, Offset, join
 from lpvid.identify import Fit, identify, simulation_fit
-from lpvid.interpolate import interpolate, leave_one_out
+from lpvid.interpolate import align_along, interpolate, leave_one_out, modal_along
 from lpvid.io import save
 from lpvid.mechanics import two_link_arm_structure
 from lpvid.models import (
@@ -36,15 +39,12 @@ from lpvid.models import (
     MechanicalStructure,
     ModalStructure,
     Polynomial,
+    PolynomialBasis,
     StateSpace,
-    align,
-    balance,
     d2c,
-    polynomial_basis,
 )
 from lpvid.restructure import Restructured, restructure_along
 
-_ARM_ORDER = 6
 # Between two ends; local models that are stable may be joined by ones that are not.
 _FROZEN = 33
 # Predicted responses further off than this do not come from one smooth family.
@@ -77,10 +77,10 @@ class _Test(NamedTuple):
 
 
 def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
-    """Read, identify each point, restructure, interpolate, test, print, write."""
+    """Read, identify each point, restructure, interpolate, refine, test, print, write."""
     started = time.perf_counter()
-    groups = _groups(arguments)
-    _check(arguments, groups)
+    groups = groups_of(arguments)
+    check(arguments, groups)
     keep_compiled_code()
     records = _read(arguments, groups)
     tests = _read_tests(arguments, records, len(next(iter(groups))))
@@ -91,11 +91,11 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
             points.append(_identify(arguments, kappa, files, records[kappa], warnings))
     structure = _structure(arguments, points[0].fit.model)
     say("Restructuring" if structure else "Aligning the black boxes")
-    models = _local_models(arguments, structure, points)
+    kappas = np.array([point.kappa for point in points])
+    models = _local_models(arguments, structure, points, kappas, warnings)
     for point, model in zip(points, models, strict=True):
         if isinstance(model, Restructured) and not bool(is_successful(model.status)):
             warnings.add(f"K = {point.name}: restructured, but: {Status[model.status]}")
-    kappas = np.array([point.kappa for point in points])
     say("Interpolating and testing")
     errors = leave_one_out(models, kappas)
     if max(errors) > 0 and not min(errors.values()) <= _LARGEST_MISS:
@@ -104,7 +104,13 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
             f"point's response is {100.0 * min(errors.values()):.3g} % off at best. Modes may "
             "cross, or the order may be wrong."
         )
-    lpv = interpolate(models, kappas, Polynomial(degree=arguments.degree))
+    interpolated = interpolate(models, kappas, Polynomial(degree=arguments.degree))
+    refinement = None
+    if arguments.refine:
+        say("Refining on all records at once")
+        refinement = refine_all(interpolated, _all_records(points), warnings)
+    refined = None if refinement is None else refinement.model
+    lpv = interpolated if refined is None else refined
     unstable_at = _unstable_at(lpv, kappas)
     if unstable_at is not None:
         warnings.add(
@@ -121,13 +127,15 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
         "order": arguments.order,
         "structure": arguments.structure,
         "points": [
-            _point_content(point, model, lpv) for point, model in zip(points, models, strict=True)
+            _point_content(point, model, interpolated, refined)
+            for point, model in zip(points, models, strict=True)
         ],
-        "degree": max(sum(powers) for powers in lpv.basis.exponents),
+        "degree": _degree(lpv),
         "leave_one_out": errors,
+        "refined": None if refinement is None else refinement.content,
         "stable_over_range": unstable_at is None,
         "parameter_names": lpv.structure.parameter_names,
-        "test": [_test_content(test, lpv, points) for test in tests],
+        "test": [_test_content(test, interpolated, refined, points) for test in tests],
     }
     print_all(arguments, content, [point.name for point in points])
     if arguments.out is not None:
@@ -137,75 +145,6 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
         content |= {"seconds": time.perf_counter() - started, "warnings": warnings.messages}
         write_json(arguments.json, content)
         print(f"Figures written to {arguments.json}")
-
-
-def _groups(arguments: argparse.Namespace) -> dict[tuple[float, ...], list[str]]:
-    """Files by operating point, in rising order: restructuring looks at neighbours."""
-    groups: dict[tuple[float, ...], list[str]] = {}
-    for text, file in arguments.at:
-        kappa = _numbers(text)
-        if kappa is None:
-            raise UsageError(f"--at: {text.strip()!r} is no number (or several, as 0.1,2)")
-        groups.setdefault(kappa, []).append(file)
-    if len({len(kappa) for kappa in groups}) > 1:
-        raise UsageError("--at: every K must have equally many numbers")
-    if len(groups) < 2:
-        raise UsageError("--at: at least two operating points are needed")
-    return dict(sorted(groups.items()))
-
-
-def _numbers(text: str) -> tuple[float, ...] | None:
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        return None
-    return values if all(math.isfinite(value) for value in values) else None
-
-
-def _check(arguments: argparse.Namespace, groups: dict[tuple[float, ...], list[str]]) -> None:
-    check_columns(arguments)
-    sources = [file for files in groups.values() for file in files]
-    sources += [file for _, file in arguments.test]
-    check_targets({"--out": arguments.out, "--json": arguments.json}, sources)
-    _check_degree(arguments.degree, np.array(list(groups)))
-    name, order = arguments.structure, arguments.order
-    if (arguments.lengths is not None) != (name == "two-link-arm"):
-        needed = "needs" if arguments.lengths is None else "is for"
-        first, second = (
-            ("the structure two-link-arm", "--lengths L1,L2")
-            if arguments.lengths is None
-            else ("--lengths", "the structure two-link-arm only")
-        )
-        raise UsageError(f"{first} {needed} {second}")
-    if arguments.measured is not None and name != "mechanical":
-        raise UsageError("--measured is for the structure mechanical only")
-    if name in ("modal", "mechanical") and order % 2:
-        raise UsageError(f"--order: the structure {name} has two states a mode, {order} is odd")
-    if name == "two-link-arm" and order != _ARM_ORDER:
-        raise UsageError(f"--order: the structure two-link-arm has {_ARM_ORDER} states")
-    if name == "mechanical" and {len(arguments.input), len(arguments.output)} != {order // 2}:
-        raise UsageError(
-            f"--order: the structure mechanical has one input and one output a degree of freedom, "
-            f"{order // 2} for order {order}"
-        )
-
-
-def _check_degree(degree: int | str, kappas: np.ndarray) -> None:
-    if isinstance(degree, str):
-        return
-    count, width = kappas.shape
-    # Monomials of that total degree at most.
-    needed = math.comb(width + degree, degree)
-    if count < needed:
-        raise UsageError(
-            f"--degree: {degree} in {width} scheduling variable(s) needs {needed} distinct points "
-            f"--at, {count} given; lower it or add operating points"
-        )
-    if np.linalg.matrix_rank(np.asarray(polynomial_basis(kappas, degree)(kappas))) < needed:
-        raise UsageError(
-            f"--degree: {degree} needs {needed} points --at that do not all lie on a curve of this "
-            "degree; lower it or add operating points"
-        )
 
 
 def _read(
@@ -223,7 +162,7 @@ def _read_tests(
     dt = next(iter(records.values())).dt
     tests = []
     for text, file in arguments.test:
-        kappa = _numbers(text)
+        kappa = numbers(text)
         columns = [] if kappa is not None else [part.strip() for part in text.split(",")]
         if len(columns if kappa is None else kappa) != n_scheduling:
             raise UsageError(
@@ -252,6 +191,8 @@ def _identify(
         fit = identify(data, subspace_method(arguments))
     except ValueError as error:
         raise UsageError(f"at K = {written(kappa)}: {error}") from error
+    if offset is not None and fit.output_offset is not None:
+        data, offset = without_rest(data, offset, fit.output_offset)
     # Of an ill-conditioned fit, `identify` says only that.
     if not bool(fit.model.is_stable()) and not bool(fit.status == Status.unstable):
         warnings.add("the model is not stable; ask for --stabilise, or another --order")
@@ -278,26 +219,50 @@ def _structure(arguments: argparse.Namespace, model: StateSpace) -> AbstractStru
 
 
 def _local_models(
-    arguments: argparse.Namespace, structure: AbstractStructure | None, points: list[_Point]
+    arguments: argparse.Namespace,
+    structure: AbstractStructure | None,
+    points: list[_Point],
+    kappas: np.ndarray,
+    warnings: Warnings,
 ) -> list[Restructured] | list[StateSpace]:
+    black_boxes = [point.continuous for point in points]
     if structure is not None:
         return restructure_along(
-            [point.continuous for point in points],
+            black_boxes,
             structure,
             starts=arguments.starts,
             key=jax.random.key(arguments.seed),
         )
-    for point in points:
-        if not bool(point.continuous.is_stable()):
+    try:
+        return modal_along(black_boxes, kappas)
+    except ValueError:
+        if arguments.refine:
             raise UsageError(
-                f"at K = {point.name}: the model is unstable and cannot be aligned; ask for "
-                "--stabilise, or another --order"
-            )
-    aligned = [balance(points[0].continuous)[0]]
-    for point in points[1:]:
-        # To the neighbour, not to the first: bases drift along K as the models do.
-        aligned.append(align(point.continuous, aligned[-1]))
+                "--refine: a local model has modes that cannot be told apart, so there are no "
+                "states to refine in; ask for another --order, or leave --refine out"
+            ) from None
+    try:
+        aligned = align_along(black_boxes, kappas)
+    except ValueError as error:
+        raise UsageError(
+            "the local models have modes that cannot be told apart, and are too unstable to be "
+            "aligned as they are; ask for --stabilise, or another --order"
+        ) from error
+    warnings.add(
+        "A local model has modes that cannot be told apart (equal poles, or more states than it "
+        "needs), so the states were aligned as a whole; a lower --order may do better."
+    )
     return aligned
+
+
+def _all_records(points: list[_Point]) -> IOData:
+    """The local records one after the other, each with its scheduling."""
+    return join(
+        [
+            point.data.replace(kappa=np.tile(point.kappa, (point.data.n_samples, 1)))
+            for point in points
+        ]
+    )
 
 
 def _unstable_at(lpv: LPVStateSpace, kappas: np.ndarray) -> tuple[float, ...] | None:
@@ -313,10 +278,17 @@ def _unstable_at(lpv: LPVStateSpace, kappas: np.ndarray) -> tuple[float, ...] | 
     return tuple(unstable[0].tolist()) if len(unstable) else None
 
 
+def _degree(lpv: LPVStateSpace) -> int:
+    assert isinstance(lpv.basis, PolynomialBasis)
+    return max(sum(powers) for powers in lpv.basis.exponents)
+
+
 def _point_content(
-    point: _Point, model: Restructured | StateSpace, lpv: LPVStateSpace
+    point: _Point,
+    model: Restructured | StateSpace,
+    interpolated: LPVStateSpace,
+    refined: LPVStateSpace | None,
 ) -> dict[str, Any]:
-    frozen = lpv.at(np.array(point.kappa)).discretise(point.data.dt)
     content: dict[str, Any] = {
         "kappa": point.kappa,
         "files": point.files,
@@ -326,7 +298,8 @@ def _point_content(
         "offsets": offsets_of(point.offset),
         "poles": poles_of(point.fit.model),
         "fit": simulation_fit(point.fit.model, point.data),
-        "fit_lpv": simulation_fit(frozen, point.data),
+        "fit_lpv": _score(interpolated, point.kappa, point.data),
+        "fit_refined": None if refined is None else _score(refined, point.kappa, point.data),
     }
     if isinstance(model, Restructured):
         norm = float(hinf_norm(point.continuous).value)
@@ -342,13 +315,23 @@ def _point_content(
     return content
 
 
-def _test_content(test: _Test, lpv: LPVStateSpace, points: list[_Point]) -> dict[str, Any]:
-    # A frozen model is simulated as such: one matrix exponential instead of one a sample.
-    model = lpv if test.kappa is None else lpv.at(np.array(test.kappa)).discretise(test.data.dt)
+def _test_content(
+    test: _Test,
+    interpolated: LPVStateSpace,
+    refined: LPVStateSpace | None,
+    points: list[_Point],
+) -> dict[str, Any]:
     return {
         "kappa": test.asked if test.kappa is None else test.kappa,
         "file": test.file,
         "offsets": offsets_of(test.offset),
-        "lpv": simulation_fit(model, test.data),
+        "lpv": _score(interpolated, test.kappa, test.data),
+        "refined": None if refined is None else _score(refined, test.kappa, test.data),
         "local": {point.name: simulation_fit(point.fit.model, test.data) for point in points},
     }
+
+
+def _score(lpv: LPVStateSpace, kappa: tuple[float, ...] | None, data: IOData) -> Array:
+    # A frozen model is simulated as such: one matrix exponential instead of one a sample.
+    model = lpv if kappa is None else lpv.at(np.array(kappa)).discretise(data.dt)
+    return simulation_fit(model, data)

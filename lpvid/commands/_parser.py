@@ -171,7 +171,8 @@ def _add_lpv(commands) -> None:
         "lpv",
         help="one LPV model from records at several operating points",
         description="Identify a local model at each operating point, restructure, interpolate in "
-        "the scheduling variable, test. K is a number, or several with commas between them.",
+        "the scheduling variable, refine if asked, test. K is a number, or several with commas "
+        "between them.",
     )
     lpv.add_argument(
         "--at",
@@ -209,6 +210,11 @@ def _add_lpv(commands) -> None:
     lpv.add_argument("--measured", choices=MEASURED, help="for mechanical (displacement)")
     lpv.add_argument(
         "--starts", type=values.count, default=24, metavar="N", help="of the search (%(default)s)"
+    )
+    lpv.add_argument(
+        "--refine",
+        action="store_true",
+        help="refine the LPV model on all records --at at once, by output error",
     )
     _add_seed(lpv)
     _add_files_out(lpv)

@@ -1,5 +1,7 @@
 """Plants built from their energies, and what excites them."""
 
+from lpvid.mechanics._arm_gray_box import LinearisedTwoLinkArm as LinearisedTwoLinkArm
+from lpvid.mechanics._arm_gray_box import two_link_arm_gray_box as two_link_arm_gray_box
 from lpvid.mechanics._arm_structure import ArmScales as ArmScales
 from lpvid.mechanics._arm_structure import DissipativeTwoLinkArm as DissipativeTwoLinkArm
 from lpvid.mechanics._arm_structure import TwoLinkArmStructure as TwoLinkArmStructure

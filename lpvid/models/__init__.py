@@ -20,6 +20,8 @@ from lpvid.models._exchange import from_scipy as from_scipy
 from lpvid.models._exchange import to_control as to_control
 from lpvid.models._exchange import to_scipy as to_scipy
 from lpvid.models._frequency import frequency_response as frequency_response
+from lpvid.models._gray_box_lpv import GrayBoxLPV as GrayBoxLPV
+from lpvid.models._gray_box_lpv import ScheduledStructure as ScheduledStructure
 from lpvid.models._hold import AbstractConversion as AbstractConversion
 from lpvid.models._hold import Tustin as Tustin
 from lpvid.models._hold import ZeroOrderHold as ZeroOrderHold

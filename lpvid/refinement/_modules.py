@@ -1,5 +1,6 @@
 """LPV and nonlinear models: any module that simulates, its arrays the parameters."""
 
+import inspect
 from typing import Any
 
 import equinox as eqx
@@ -8,39 +9,47 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lpvid.models import LPVStateSpace
+from lpvid.models import GrayBoxLPV, LPVStateSpace
 from lpvid.refinement._parameterisation import AbstractParameterisation, Record, Values
+
+# The one leaf of an LPV model that is estimated.
+_ESTIMATED = {LPVStateSpace: "coefficients", GrayBoxLPV: "parameters"}
 
 
 class ModuleParameterisation(AbstractParameterisation):
     """A module with `simulate(u=, dt=, x0=)`: its inexact arrays are the values, leaf by leaf.
 
-    Of an `LPVStateSpace` the coefficients alone are.
+    Of an `LPVStateSpace` the coefficients alone are, of a `GrayBoxLPV` its parameters.
 
     Attributes:
         model: the module, at any values.
         dt: sample time of the records.
         states: length of the initial state; 0 where the module names none.
+        schedules: "still" where κ is known to be constant within every record of an LPV model,
+            which is then frozen; "mixed" where it is in some; "moving" otherwise.
     """
 
     model: Any
     dt: float = eqx.field(static=True)
     states: int = eqx.field(static=True)
+    schedules: str = eqx.field(static=True, default="moving")
 
     def _leaves(self) -> list[tuple[str, Array, int]]:
         """Name, array and place (among all leaves) of what is estimated."""
         paths = jax.tree_util.tree_leaves_with_path(self.model)
+        only = _ESTIMATED.get(type(self.model))
         found = []
         for place, (path, leaf) in enumerate(paths):
             name = jax.tree_util.keystr(path).lstrip(".")
-            wanted = name == "coefficients" or not isinstance(self.model, LPVStateSpace)
-            if eqx.is_inexact_array(leaf) and wanted:
+            if eqx.is_inexact_array(leaf) and only in (None, name):
                 found.append((name, leaf, place))
         return found
 
     @property
     def names(self) -> tuple[str, ...]:
-        """A leaf's path, with indices for arrays: `mass`, `coefficients[0,2]`."""
+        """A leaf's path, with indices for arrays: `mass`, `coefficients[0,2]`; or its own names."""
+        if isinstance(self.model, GrayBoxLPV):
+            return self.model.parameter_names
         return tuple(
             name + (f"[{','.join(map(str, index))}]" if index else "")
             for name, leaf, _ in self._leaves()
@@ -93,12 +102,29 @@ class ModuleParameterisation(AbstractParameterisation):
     def respond(
         self, prepared: Float[Array, " value"], record: Record, x0: Array
     ) -> Float[Array, "time ny"]:
-        """Simulation by the module."""
-        options: dict[str, Any] = {"x0": x0} if self.states else {}
-        if isinstance(self.model, LPVStateSpace):
-            options["kappa"] = record.kappa
+        """Simulation by the module, frozen where κ rests: one matrix exponential for the record."""
         model = self.build(prepared)
-        return model.simulate(u=record.u, dt=self.dt, **options)
+        if type(self.model) not in _ESTIMATED:
+            options: dict[str, Any] = {"x0": x0} if self.states else {}
+            if takes_schedule(self.model) and record.kappa is not None:
+                options["kappa"] = record.kappa
+            return model.simulate(u=record.u, dt=self.dt, **options)
+        kappa = record.kappa
+        assert kappa is not None
+
+        def moving():
+            return model.simulate(u=record.u, kappa=kappa, dt=self.dt, x0=x0)
+
+        def still():
+            frozen = model.at(kappa[0])
+            frozen = frozen if frozen.is_discrete else frozen.discretise(self.dt)
+            return frozen.simulate(u=record.u, x0=x0)
+
+        if self.schedules == "still":
+            return still()
+        if self.schedules == "moving":
+            return moving()
+        return jax.lax.cond(jnp.all(kappa == kappa[:1]), still, moving)
 
     @property
     def overlap(self) -> int:
@@ -111,3 +137,8 @@ class ModuleParameterisation(AbstractParameterisation):
         """Simulated output, and its first and its overlapping samples."""
         y = self.respond(prepared, record, x0)
         return y[:size], y[: self.overlap].reshape(-1), y[size:].reshape(-1)
+
+
+def takes_schedule(model: Any) -> bool:
+    """Whether a module's `simulate` wants κ."""
+    return "kappa" in inspect.signature(model.simulate).parameters

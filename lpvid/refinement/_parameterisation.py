@@ -240,19 +240,22 @@ def channel_sizes(signal: Float[Array, "time channel"]) -> Float[Array, " channe
 
 
 def padded_records(data: IOData) -> tuple[Record, Array]:
-    """All records along a leading axis, padded with zeros to the longest, and where they count."""
+    """All records along a leading axis, padded to the longest, and where they count.
+
+    Signals are padded with zeros, the schedule with its last value: it may rest.
+    """
     longest = max(data.lengths)
     starts = np.cumsum([0, *data.lengths])
 
-    def stack(signal: Array) -> Array:
+    def stack(signal: Array, mode: str = "constant") -> Array:
         if len(set(data.lengths)) == 1:
             return signal.reshape(len(data.lengths), longest, signal.shape[1])
         parts = [
-            jnp.pad(signal[start : start + length], ((0, longest - length), (0, 0)))
+            jnp.pad(signal[start : start + length], ((0, longest - length), (0, 0)), mode=mode)
             for start, length in zip(starts, data.lengths, strict=False)
         ]
         return jnp.stack(parts)
 
     mask = np.arange(longest)[None, :] < np.asarray(data.lengths)[:, None]
-    kappa = None if data.kappa is None else stack(data.kappa)
+    kappa = None if data.kappa is None else stack(data.kappa, "edge")
     return Record(stack(data.u), stack(data.y), kappa), jnp.asarray(mask)

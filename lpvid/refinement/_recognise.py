@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 
 from lpvid.data import IOData
 from lpvid.identify import ContinuousTimeFit, Fit, MechanicalFit, StepResponseFit
-from lpvid.models import FreeStructure, LPVStateSpace, StateSpace, StructuredModel, balancing
-from lpvid.refinement._modules import ModuleParameterisation
+from lpvid.models import FreeStructure, StateSpace, StructuredModel, balancing
+from lpvid.refinement._modules import ModuleParameterisation, takes_schedule
 from lpvid.refinement._parameterisation import (
     AbstractParameterisation,
     LinearParameterisation,
@@ -148,16 +148,27 @@ def _structured(model: StructuredModel, data: IOData, estimates_gain: bool, gain
     return Start(kind, values)
 
 
+def _schedules(data: IOData) -> str:
+    """Whether κ rests in all records, in some, or in none; "moving" where that is not known."""
+    if data.kappa is None or isinstance(data.kappa, Tracer):
+        return "moving"
+    rests = [bool(np.all(kappa == kappa[:1])) for kappa in _per_record(data)]
+    if all(rests):
+        return "still"
+    return "mixed" if any(rests) else "moving"
+
+
+def _per_record(data: IOData) -> list[np.ndarray]:
+    return np.split(np.asarray(data.kappa), np.cumsum(data.lengths)[:-1])
+
+
 def _module(model: Any, data: IOData, estimates_gain: bool) -> Start:
     if estimates_gain:
         raise ValueError("predictor: Innovation() is for linear models of constant matrices.")
-    if isinstance(model, LPVStateSpace):
-        if data.kappa is None:
-            raise ValueError("data: an LPV model needs the scheduling; give kappa= to IOData.")
-        states = model.structure.matrices(model.parameters(data.kappa[0])).nx
-    else:
-        states = int(getattr(model, "n_states", getattr(model, "nx", 0)))
-    kind = ModuleParameterisation(model, data.dt, states)
+    if data.kappa is None and takes_schedule(model):
+        raise ValueError("data: an LPV model needs the scheduling; give kappa= to IOData.")
+    states = int(getattr(model, "n_states", getattr(model, "nx", 0)))
+    kind = ModuleParameterisation(model, data.dt, states, _schedules(data))
     if not kind.names:
         raise ValueError("model: it holds no inexact arrays, so there is nothing to estimate.")
     values = kind.start()

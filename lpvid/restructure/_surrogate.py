@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from lpvid._solve import Bounds, minimise
 from lpvid.models import AbstractStructure
-from lpvid.restructure._matching import Target, response_error
+from lpvid.restructure._matching import Target, largest_gain, response_error, scaling
 
 Peaks = Float[Array, " peak"]
 
@@ -62,7 +62,7 @@ def refine_smooth(
     """
     bounds = Bounds(*structure.bounds())
     free = bounds.free(start)
-    shape = _scaling(structure, bounds, free, target)
+    shape = scaling(lambda x: response_error(structure, bounds.bounded(x), target), free)
 
     def one_round(state, log2_power):
         best, best_norm = state
@@ -88,11 +88,6 @@ def refine_smooth(
     return SmoothDescent(bounds.bounded(best), jnp.concatenate([first[None], history]))
 
 
-def largest_gain(error: Array) -> Float[Array, ""]:
-    """Largest singular value over all frequencies of the grid."""
-    return jnp.max(jnp.linalg.svd(error, compute_uv=False))
-
-
 def _refined(structure, parameters, target: Target, peaks: Peaks) -> Target:
     """The target on a grid with the peaks and the structured model's own resonances."""
     if target.black_box is None:
@@ -104,22 +99,4 @@ def _refined(structure, parameters, target: Target, peaks: Peaks) -> Target:
     grid = jnp.concatenate(
         [target.omega, 0.9 * extra, 0.97 * extra, extra, 1.03 * extra, 1.1 * extra]
     )
-    return Target(grid, target.black_box.frequency_response(grid), target.black_box)
-
-
-def _scaling(structure, bounds, free, target) -> Float[Array, "parameter parameter"]:
-    def residual(x):
-        error = response_error(structure, bounds.bounded(x), target)
-        return jnp.concatenate([jnp.real(error).reshape(-1), jnp.imag(error).reshape(-1)])
-
-    jacobian = jax.jacfwd(residual)(free)
-    # Diagonal scaling first: the entries' sizes differ by many orders.
-    size = jnp.sqrt(jnp.sum(jacobian**2, axis=0))
-    size = jnp.maximum(size, 1e-12 * jnp.max(size) + jnp.finfo(float).tiny)
-    scaled = jacobian / size[None]
-    values, vectors = jnp.linalg.eigh(scaled.T @ scaled)
-    floor = 1e-8 * jnp.max(values)
-    inverse = vectors / jnp.sqrt(jnp.maximum(values, floor))[None]
-    # Steps of about the size of the error that is left.
-    left = jnp.linalg.norm(residual(free))
-    return (inverse / size[:, None]) * jnp.maximum(left, 1e-300)
+    return target.on(grid)

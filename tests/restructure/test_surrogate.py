@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lpvid.models import StateSpace
-from lpvid.restructure._matching import channel_weights, make_target
-from lpvid.restructure._surrogate import largest_gain, power_norm
+from lpvid.restructure._matching import channel_weights, largest_gain, make_target
+from lpvid.restructure._surrogate import power_norm
 
 RNG = np.random.default_rng(0)
 norm = jax.jit(lambda error, log2: power_norm(error, log2, 9))

@@ -1,4 +1,4 @@
-"""The study of Vizer et al. (2015): noisy local records to a global LPV model, and its check."""
+"""The study with the average model of each operating point, as 001 tells it."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -9,36 +9,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from lpvid._results import Status
+from lpvid import montecarlo
 from lpvid.analysis import bft, hinf_norm, vaf
 from lpvid.data import IOData
-from lpvid.identify import PastInputMOESP, identify
 from lpvid.interpolate import balance_along, interpolate, interpolation_fit
 from lpvid.mechanics import (
     OPERATING_POINTS,
     StudyRecords,
     TwoLinkFlexibleArm,
-    add_noise,
     reference_two_link_arm,
     study_records,
     two_link_arm_structure,
 )
-from lpvid.models import (
-    AlignedAverage,
-    LPVStateSpace,
-    Polynomial,
-    StateSpace,
-    average,
-    d2c,
-)
+from lpvid.models import LPVStateSpace, Polynomial, StateSpace
 from lpvid.restructure import Restructured, restructure_along
+from lpvid.study._identification import averages, identify_runs
 
 MODEL_NAMES = ("restructured", "analytic", "balanced")
-_ORDER = 6
-# Sixty samples of 1 ms span the arm's slowest time constant (46 ms): with fewer, the low
-# frequencies come out several per cent wrong.
-_BLOCK_ROWS = 60
-_SNR_DB = 30.0
 
 
 class StudyResult(eqx.Module):
@@ -120,10 +107,25 @@ def run_study(
         >>> result = run_study(jax.random.key(0), runs=10)  # doctest: +SKIP
         >>> result.sweep_bft["restructured"]  # doctest: +SKIP
     """
+    say = report if report is not None else silent
+    return run_stages(key, runs, degree, arm, theta2, n_samples, say)[0]
+
+
+def run_stages(
+    key: PRNGKeyArray,
+    runs: int,
+    degree: int,
+    arm: TwoLinkFlexibleArm | None,
+    theta2: Sequence[float],
+    n_samples: int,
+    say: Callable[[str], None],
+    *,
+    progress: bool = False,
+) -> tuple[StudyResult, montecarlo.Study]:
+    """`run_study`, and the black boxes that it averaged; see there."""
     if runs < 1:
         raise ValueError(f"runs: at least one noise realisation is needed, got {runs}.")
-    say = report if report is not None else _silent
-    clock = _Clock()
+    clock = Clock()
     arm = reference_two_link_arm() if arm is None else arm
     record_key, noise_key, start_key = jax.random.split(key, 3)
 
@@ -132,11 +134,11 @@ def run_study(
     clock.lap("simulate")
 
     say(f"Identifying {len(theta2) * runs} noisy records by PI-MOESP")
-    models, succeeded, noisy = _identify_all(records.local, noise_key, runs)
+    identified, noisy = identify_runs(records.local, noise_key, runs, progress=progress)
     clock.lap("identify")
 
     say("Averaging the models of each point in one basis")
-    black_boxes = _averages(models, succeeded, theta2)
+    black_boxes = averages(identified, theta2)
     clock.lap("average")
 
     say("Restructuring by the H-infinity norm")
@@ -168,7 +170,7 @@ def run_study(
     norms = jnp.stack([hinf_norm(model).value for model in analytic])
     costs = jnp.stack([result.cost for result in restructured])
     clock.lap("validate")
-    return StudyResult(
+    result = StudyResult(
         arm=arm,
         records=records,
         noisy=noisy,
@@ -184,9 +186,10 @@ def run_study(
         sweep_vaf={name: vaf(sweep.y, y) for name, y in outputs.items()},
         relative_cost=costs / norms,
         interpolation_fit=fits,
-        failed_runs=int(np.sum(~succeeded)),
+        failed_runs=identified.failed,
         seconds=clock.seconds,
     )
+    return result, identified
 
 
 def summary(result: StudyResult) -> dict:
@@ -225,11 +228,12 @@ def _plain(values: Array) -> list:
     return np.asarray(values).tolist()
 
 
-def _silent(message: str) -> None:
+def silent(message: str) -> None:
+    """Say nothing."""
     del message
 
 
-class _Clock:
+class Clock:
     """Wall time by stage."""
 
     def __init__(self):
@@ -237,58 +241,10 @@ class _Clock:
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:
+        """A stage is over."""
         now = time.perf_counter()
         self.seconds[stage] = now - self._last
         self._last = now
-
-
-def _identify_all(local: IOData, key: PRNGKeyArray, runs: int):
-    """Continuous-time models (point, run), which of them succeeded, and one noisy data set."""
-    points = local.records
-    keys = jax.random.split(key, (len(points), runs))
-    u = jnp.stack([record.u for record in points])
-    y = jnp.stack([record.y for record in points])
-    first = points[0].replace(kappa=None)
-    models, status, noisy = _identify_batch(first, u, y, keys)
-    succeeded = np.asarray(status == Status.successful)
-    finite = np.all(
-        [np.isfinite(leaf).all(axis=(-1, -2)) for leaf in jax.tree.leaves(models)], axis=0
-    )
-    example = local.replace(y=noisy[:, 0].reshape(-1, local.ny))
-    return models, succeeded & finite, example
-
-
-@eqx.filter_jit
-def _identify_batch(template: IOData, u, y, keys):
-    method = PastInputMOESP(order=_ORDER, block_rows=_BLOCK_ROWS)
-
-    def one(arguments):
-        inputs, outputs, key = arguments
-        noisy = add_noise(key, outputs, _SNR_DB)
-        fit = identify(template.replace(u=inputs, y=noisy), method, throw=False)
-        return d2c(fit.model), fit.status, noisy
-
-    # Fits one after the other: small LAPACK calls vectorise badly on a CPU.
-    def one_point(arguments):
-        inputs, outputs, point_keys = arguments
-        return jax.lax.map(lambda key: one((inputs, outputs, key)), point_keys)
-
-    return jax.lax.map(one_point, (u, y, keys))
-
-
-def _averages(models: StateSpace, succeeded: np.ndarray, theta2: Sequence[float]):
-    """Per point: the average of its models in an aligned basis."""
-    aligned = []
-    for index, kept in enumerate(succeeded):
-        if not kept.any():
-            raise ValueError(
-                f"theta2: no identification succeeded at {theta2[index]:.3g} rad; give longer "
-                "records or less noise."
-            )
-        chosen = np.flatnonzero(kept)
-        members = jax.tree.map(lambda leaf, i=index, c=chosen: leaf[i][c], models)
-        aligned.append(average(members, AlignedAverage()))
-    return aligned
 
 
 def _interpolate(models, kappas, degree: int) -> LPVStateSpace:
