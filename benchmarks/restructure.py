@@ -14,6 +14,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import multiprocessing
 import time
 import warnings
 from collections.abc import Callable
@@ -166,24 +167,17 @@ class Epigraph:
         return best
 
     def _round(self, start: np.ndarray) -> np.ndarray:
-        black_box = self.problem.black_box
-        difference = self.problem.structure.matrices(jnp.asarray(start)) - black_box
-        peaks = np.asarray(analysis.peak_frequencies(difference, _PEAKS)[0])
-        size = np.abs(np.asarray(black_box.poles()))
-        near = (peaks[:, None] * np.linspace(0.97, 1.03, 7)[None]).ravel()
-        spaced = np.geomspace(size.min() / 30.0, 1e3 * size.max(), _GRID - 1)
-        omega = jnp.asarray(np.concatenate([[0.0], spaced, near]))
-        first = float(np.max(_gains(self.problem, jnp.asarray(start), omega)))
-
-        def place(z):
-            return jnp.asarray(start + self.scaling @ z[:-1])
+        omega = self._grid(start)
+        target = _response(self.problem.black_box, omega)
+        first = float(np.max(self._gains(start, omega, target)[0]))
 
         def room(z):
-            return z[-1] - np.asarray(_gains(self.problem, place(z), omega)) / first
+            gains, _ = self._gains(start + self.scaling @ z[:-1], omega, target)
+            return z[-1] - gains / first
 
         def slope(z):
-            rows = np.asarray(_slopes(self.problem, place(z), omega)) @ self.scaling / first
-            return np.concatenate([-rows, np.ones((len(rows), 1))], axis=1)
+            _, rows = self._gains(start + self.scaling @ z[:-1], omega, target)
+            return np.concatenate([-rows @ self.scaling / first, np.ones((len(rows), 1))], axis=1)
 
         level = np.zeros(len(start) + 1)
         level[-1] = 1.0
@@ -198,27 +192,50 @@ class Epigraph:
                 method="SLSQP",
                 options={"maxiter": 150, "ftol": 1e-9},
             )
-        return np.asarray(place(found.x))
+        return start + self.scaling @ found.x[:-1]
+
+    def _grid(self, at: np.ndarray) -> np.ndarray:
+        """Evenly spaced over all decades that matter, closer about the peaks."""
+        size = np.abs(np.asarray(self.problem.black_box.poles()))
+        dense = np.geomspace(size.min() / 30.0, 1e3 * size.max(), 20 * _GRID)
+        gains, _ = self._gains(at, dense, _response(self.problem.black_box, dense))
+        inner = gains[1:-1]
+        tops = 1 + np.flatnonzero((inner >= gains[:-2]) & (inner >= gains[2:]))
+        tops = dense[tops[np.argsort(-gains[tops])][:_PEAKS]]
+        near = (tops[:, None] * np.linspace(0.97, 1.03, 7)[None]).ravel()
+        return np.concatenate([[0.0], dense[::20], near])
+
+    def _gains(self, parameters, omega, target) -> tuple[np.ndarray, np.ndarray]:
+        """Largest singular values and their derivatives; infinite where the model is."""
+        parts, slopes = _matrices(self.problem.structure, jnp.asarray(parameters))
+        (A, B, C, D), (dA, dB, dC, dD) = ([np.asarray(m) for m in ms] for ms in (parts, slopes))
+        if not all(np.all(np.isfinite(m)) for m in (A, B, C, D)):
+            return np.full(len(omega), 1e9), np.zeros((len(omega), len(parameters)))
+        resolvent = np.linalg.inv(1j * omega[:, None, None] * np.eye(len(A)) - A)
+        states, outputs = resolvent @ B, C @ resolvent
+        left, gains, right = np.linalg.svd(outputs @ B + D - target)
+        left, right = np.conj(left[:, :, 0]), np.conj(right[:, 0])
+        seen = np.einsum("fo,fon->fn", left, outputs)
+        moved = np.einsum("fni,fi->fn", states, right)
+        rows = np.einsum("fn,nmp,fm->fp", seen, dA, moved, optimize=True)
+        rows = rows + np.einsum("fn,nip,fi->fp", seen, dB, right, optimize=True)
+        rows = rows + np.einsum("fo,onp,fn->fp", left, dC, moved, optimize=True)
+        rows = rows + np.einsum("fo,oip,fi->fp", left, dD, right, optimize=True)
+        return gains[:, 0], np.real(rows)
+
+
+def _response(model: models.StateSpace, omega: np.ndarray) -> np.ndarray:
+    A, B, C, D = (np.asarray(m) for m in (model.A, model.B, model.C, model.D))
+    return C @ np.linalg.solve(1j * omega[:, None, None] * np.eye(len(A)) - A, B[None]) + D
 
 
 @eqx.filter_jit
-def _largest(structure, black_box, parameters, omega):
-    model = structure.matrices(parameters)
-    error = model.frequency_response(omega) - black_box.frequency_response(omega)
-    return jnp.linalg.svd(error, compute_uv=False)[:, 0]
+def _matrices(structure, parameters):
+    def parts(p):
+        model = structure.matrices(p)
+        return model.A, model.B, model.C, model.D
 
-
-def _gains(problem: Problem, parameters, omega):
-    return _largest(problem.structure, problem.black_box, parameters, omega)
-
-
-@eqx.filter_jit
-def _largest_slopes(structure, black_box, parameters, omega):
-    return jax.jacfwd(lambda p: _largest(structure, black_box, p, omega))(parameters)
-
-
-def _slopes(problem: Problem, parameters, omega):
-    return _largest_slopes(problem.structure, problem.black_box, parameters, omega)
+    return parts(parameters), jax.jacfwd(parts)(parameters)
 
 
 def _norm(problem: Problem, parameters: np.ndarray) -> float:
@@ -239,8 +256,10 @@ def solve(problem: Problem, *, starts: int = 24, method: HinfMatching | None = N
         raise ValueError("method: the non-smooth stage is what is measured; set bundle_steps.")
     norm = float(found.error_norm)
     seconds = time.process_time() - begun
+    # As many copies as there were starts: nothing is compiled for another shape.
+    truth = np.tile(problem.truth, (starts, 1))
     again = restructure(
-        problem.black_box, problem.structure, starts=0, initial=problem.truth, method=method
+        problem.black_box, problem.structure, starts=0, initial=truth, method=method
     )
     match = HinfMatching(passes=0, bundle_steps=0)
     matched = restructure(problem.black_box, problem.structure, **options, method=match)
@@ -258,9 +277,23 @@ def solve(problem: Problem, *, starts: int = 24, method: HinfMatching | None = N
     )
 
 
-def run(count: int = 50, seed: int = 0) -> list[Row]:
-    """Rows of all problems."""
-    return [solve(problem) for problem in tqdm(problems(count, seed), desc="problems")]
+def run(count: int = 50, seed: int = 0, jobs: int = 1) -> list[Row]:
+    """Rows of all problems, one kind of problem (compiled once) a job."""
+    numbers = [range(first, count, len(KINDS)) for first in range(min(count, len(KINDS)))]
+    tasks = [(count, seed, tuple(chosen)) for chosen in numbers]
+    rows: dict[int, Row] = {}
+    spawn = multiprocessing.get_context("spawn")
+    with tqdm(total=count, desc="problems") as bar, spawn.Pool(jobs) as pool:
+        for solved in pool.imap_unordered(_solve_some, tasks):
+            rows |= solved
+            bar.update(len(solved))
+    return [rows[index] for index in sorted(rows)]
+
+
+def _solve_some(task: tuple[int, int, tuple[int, ...]]) -> dict[int, Row]:
+    count, seed, chosen = task
+    given = problems(count, seed)
+    return {index: solve(given[index]) for index in chosen}
 
 
 def main() -> None:
@@ -268,8 +301,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--problems", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     arguments = parser.parse_args()
-    rows = run(arguments.problems, arguments.seed)
+    rows = run(arguments.problems, arguments.seed, arguments.jobs)
     print(f"{'problem':18s} {'norm':>12s} {'above best':>11s} {'distance':>9s} {'CPU s':>7s}")
     for row in rows:
         mark = "" if row.above <= MOST_ABOVE else "  *"

@@ -236,11 +236,7 @@ def _local_models(
     try:
         return modal_along(black_boxes, kappas)
     except ValueError:
-        if arguments.refine:
-            raise UsageError(
-                "--refine: a local model has modes that cannot be told apart, so there are no "
-                "states to refine in; ask for another --order, or leave --refine out"
-            ) from None
+        pass
     try:
         aligned = align_along(black_boxes, kappas)
     except ValueError as error:

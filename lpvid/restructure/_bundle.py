@@ -24,7 +24,10 @@ from lpvid.restructure._quadratic import Rows, join_rows, minimise_level
 # Proximity control: shares of the promised decrease, and what they do to the proximal weight.
 _ACCEPTED = 0.05
 _POOR, _GOOD = 0.25, 0.7
+_LOWERED, _RAISED = 0.1, 4.0
 _FIRST_WEIGHT, _LEAST_WEIGHT, _REJECTED_WEIGHT, _MOST_WEIGHT = 1e-2, 1e-8, 1e-3, 1e8
+# A peak and one of the model before it are the same one this close (in logarithms).
+_SAME_PEAK = 0.1
 # A relative decrease below the accuracy of the norm cannot be judged.
 _ROUNDING = 1e-12
 
@@ -42,12 +45,43 @@ class _State(NamedTuple):
     point: Float[Array, " parameter"]
     peaks: Peaks
     trial: Float[Array, " parameter"]
+    step: Float[Array, " direction"]
     promised: Scalar
     aggregate: Rows
     metric: Float[Array, "direction direction"]
     weight: Scalar
+    refused: Bool[Array, ""]
     steps: Int[Array, ""]
     ended: Bool[Array, ""]
+
+
+class _Refused(NamedTuple):
+    """A trial that did not lower the norm, seen from the point that it was made from.
+
+    Attributes:
+        model: the error at the trial and its slopes there.
+        step: the trial, from the point.
+        kept: whether there is one.
+        home: which of the point's places each peak of the trial belongs to.
+    """
+
+    model: Expansion
+    step: Float[Array, " direction"]
+    kept: Bool[Array, ""]
+    home: Int[Array, " place"]
+
+    def planes(self, metric: Array) -> Rows:
+        """Tangent planes of the trial, less the metric's share, which is added to all planes.
+
+        They bring what the trial showed of each gain's own curvature, without which no step along
+        several curved gains is short enough (the Maratos effect). Shifted down to the present
+        level where they cut off the point itself, as the norm is not convex.
+        """
+        cuts = cutting_planes(self.model, self.model.vectors[:, :, 0])
+        bent = metric @ self.step
+        room = cuts.limits + cuts.slopes @ self.step - 0.5 * self.step @ bent
+        cuts = Rows(cuts.slopes - bent[None], cuts.lifted, jnp.maximum(room, 0.0))
+        return cuts.only(jnp.broadcast_to(self.kept, room.shape))
 
 
 class _Step(NamedTuple):
@@ -61,7 +95,13 @@ class _Step(NamedTuple):
 
 
 def _solve_model(
-    error: ErrorAt, model: Expansion, limits: Rows, metric: Array, weight: Array, stationary: Array
+    error: ErrorAt,
+    model: Expansion,
+    refused: _Refused,
+    limits: Rows,
+    metric: Array,
+    weight: Array,
+    stationary: Array,
 ) -> _Step:
     """Cutting planes, then the curvature that their multipliers ask for, then the step again."""
     count, n = model.error.shape[0], model.slopes.shape[0]
@@ -72,7 +112,7 @@ def _solve_model(
         directions, metric, _ = carry
         there = jnp.repeat(jnp.arange(planes) <= index, count)
         cuts = join_rows(*(cutting_planes(model, v) for v in directions)).only(there)
-        rows = join_rows(cuts, limits)
+        rows = join_rows(cuts, refused.planes(metric), limits)
         weighted = metric + weight * jnp.eye(n)
         found = minimise_level(weighted, rows)
         multipliers = jnp.where(rows.lifted > 0.0, found.multipliers, 0.0)
@@ -80,6 +120,8 @@ def _solve_model(
             (multipliers @ rows.slopes)[None], jnp.ones(1), (multipliers @ rows.limits)[None]
         )
         by_plane = multipliers[: planes * count].reshape(planes, count)
+        later = multipliers[planes * count :][: refused.home.shape[0]]
+        by_plane = by_plane.at[0, refused.home].add(later)
         values, vectors = jnp.linalg.eigh(curvature(error, model, directions, by_plane, stationary))
         renewed = (vectors * jnp.abs(values)[None]) @ vectors.T
         turned = model_directions(model, found.x)
@@ -96,6 +138,14 @@ def _solve_model(
         model.vectors[None, :, :, 0], (planes, count, model.error.shape[2])
     )
     return jax.lax.fori_loop(0, rounds, solve, (directions, metric, unsolved))[2]
+
+
+def _homes(trial: Places, point: Places) -> Int[Array, " place"]:
+    """Nearest peak of the point for each of the trial's; itself, further on, where none is near."""
+    first, second = (jnp.log(jnp.maximum(places.omega, 1e-12)) for places in (trial, point))
+    apart = jnp.abs(first[:, None] - second[None])
+    own = second.shape[0] + jnp.arange(first.shape[0])
+    return jnp.where(jnp.min(apart, axis=1) < _SAME_PEAK, jnp.argmin(apart, axis=1), own)
 
 
 def bound_rows(bounds: Bounds, point: Array, shape: Array) -> Rows:
@@ -119,11 +169,12 @@ def descend_nonsmooth(
 
     The bundle is one of frequencies: the peaks of the error at the best point and those of the
     last trial. Their cutting planes (equations 19 and 20, also along the singular vectors that the
-    local model turns to) and the aggregate of the last program make the piecewise linear model; its
-    step minimises the model plus a quadratic, half Hessian of the Lagrangian and half proximal
-    weight, which falls after steps as good as promised and rises after others (P. Apkarian,
-    D. Noll, O. Prot, J. Convex Anal. 16 (2009) 641-666). Bounds are constraints of the program, so
-    a solution may lie on them. Steps to unstable models are refused where `stable` says so.
+    local model turns to), the tangent planes of a trial that was refused and the aggregate of the
+    last program make the piecewise linear model; its step minimises the model plus a quadratic,
+    half Hessian of the Lagrangian and half proximal weight, which falls after steps as good as
+    promised and rises after others (P. Apkarian, D. Noll, O. Prot, J. Convex Anal. 16 (2009)
+    641-666). Bounds are constraints of the program, so a solution may lie on them. Steps to
+    unstable models are refused where `stable` says so.
 
     Works under `jit`; a batch costs least through `jax.lax.map`.
     """
@@ -144,8 +195,10 @@ def descend_nonsmooth(
         share = gained / jnp.maximum(state.promised, 1e-300)
         better = jnp.isfinite(tried.norm) & (gained > 0.0) & (share > _ACCEPTED)
         accepted = first | better
-        factor = jnp.where(share > _GOOD, 0.1, jnp.where(share > _POOR, 1.0, 4.0))
-        weight = jnp.maximum(10.0 * state.weight, _REJECTED_WEIGHT)
+        factor = jnp.where(share > _GOOD, _LOWERED, jnp.where(share > _POOR, 1.0, _RAISED))
+        # What a first refusal shows may be all that lacked; only the next ones shorten the step.
+        weight = jnp.where(state.refused, _RAISED, 1.0) * state.weight
+        weight = jnp.maximum(weight, _REJECTED_WEIGHT)
         weight = jnp.where(better, jnp.maximum(factor * state.weight, _LEAST_WEIGHT), weight)
         weight = jnp.where(first, _FIRST_WEIGHT, weight)
         point = jnp.where(accepted, state.trial, state.point)
@@ -160,7 +213,15 @@ def descend_nonsmooth(
         limits = join_rows(aggregate, bound_rows(bounds, point, shape))
         stationary = jnp.arange(count) < peaks.gains.shape[0]
         model = expand(error, n, count)
-        step = _solve_model(error, model, limits, state.metric, weight, stationary)
+        refused = _Refused(
+            expand(
+                error_at(structure, state.trial, shape, target, tried.places), n, count // 2
+            )._replace(top=model.top),
+            state.step,
+            ~accepted & jnp.isfinite(tried.norm),
+            _homes(tried.places, peaks.places),
+        )
+        step = _solve_model(error, model, refused, limits, state.metric, weight, stationary)
 
         small = 0.1 * tolerance
         certain = (step.left <= small) & (step.aggregate.limits[0] <= small)
@@ -170,10 +231,12 @@ def descend_nonsmooth(
             point=point,
             peaks=peaks,
             trial=jnp.clip(point + shape @ step.x, lower, upper),
+            step=step.x,
             promised=step.promised,
             aggregate=step.aggregate,
             metric=step.metric,
             weight=weight,
+            refused=~accepted,
             steps=state.steps + 1,
             ended=certain | hopeless | nothing_left,
         )
@@ -183,10 +246,12 @@ def descend_nonsmooth(
         point=start,
         peaks=jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), unknown),
         trial=start,
+        step=jnp.zeros(n),
         promised=jnp.asarray(0.0),
         aggregate=Rows(jnp.zeros((1, n)), jnp.ones(1), jnp.zeros(1)),
         metric=jnp.zeros((n, n)),
         weight=jnp.asarray(_FIRST_WEIGHT),
+        refused=jnp.asarray(False),
         steps=jnp.asarray(0),
         ended=jnp.asarray(False),
     )

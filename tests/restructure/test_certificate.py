@@ -1,5 +1,8 @@
 """The non-smooth stage: minima by SciPy, certificates by finite differences and SciPy."""
 
+import importlib.util
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -97,6 +100,7 @@ def test_a_minimum_may_lie_on_a_bound():
     assert best.certificate.at_bound.tolist() == [False, True]
 
 
+@pytest.mark.slow
 def test_a_point_that_is_no_minimum_is_not_certified():
     quick = HinfMatching(match_steps=1, passes=0, bundle_steps=1)
     best = restructure(TWO_LAGS, LAG, starts=0, initial=[100.0, 0.1], method=quick)
@@ -168,10 +172,31 @@ def test_the_certificate_holds_for_several_channels():
     black_box = structure.matrices(jnp.asarray(truth)) + weak
     best = restructure(black_box, structure, starts=0, initial=truth, method=BUNDLE_ONLY)
     assert best.error_norm < best.history[0]
-    # Certified or not: the distance is the one that SciPy finds.
-    distance = shortest(subgradients(black_box, best))
-    np.testing.assert_allclose(best.certificate.distance, distance, rtol=1e-2, atol=1e-5)
-    assert best.certificate.certified == (best.certificate.distance <= BUNDLE_ONLY.tolerance)
+    # Three peaks, two of them close together, and far from straight along the steps.
+    assert best.certificate.certified and is_successful(best.status)
+    assert shortest(subgradients(black_box, best)) <= 2.0 * BUNDLE_ONLY.tolerance
+
+
+BENCHMARK = Path(__file__).resolve().parents[2] / "benchmarks" / "restructure.py"
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    spec = importlib.util.spec_from_file_location("benchmark_restructure", BENCHMARK)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("numbers", [(2, 9), (3, 10), (6,)], ids=str)
+def test_nothing_better_is_found_by_slsqp_or_from_the_truth(benchmark, numbers):
+    problems = benchmark.problems(1 + max(numbers))
+    for number in numbers:
+        row = benchmark.solve(problems[number])
+        assert row.above <= 1e-3
+        assert row.certified
 
 
 @pytest.mark.parametrize(
