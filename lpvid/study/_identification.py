@@ -65,7 +65,7 @@ def identify_runs(
     keys = jax.random.split(key, runs)
     records = local.records
     points = {name: jnp.stack([getattr(r, name) for r in records]) for name in ("u", "y")}
-    pipeline = Identification(records[0].replace(kappa=None))
+    pipeline = Identification(records[0])
     study = montecarlo.run(pipeline, keys, points=points, progress=progress)
     noisy = [
         add_noise(jax.random.fold_in(keys[0], i), record.y, _SNR_DB)
