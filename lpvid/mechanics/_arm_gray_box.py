@@ -22,7 +22,7 @@ _FIELDS = (
 
 
 class LinearisedTwoLinkArm(eqx.Module):
-    """(Logarithms of the physical parameters, cos θ2) → the arm linearised at rest.
+    """(Physical parameters, cos θ2) → the arm linearised at rest.
 
     Attributes:
         link_lengths: ℓ, m, which are known.
@@ -40,7 +40,7 @@ class LinearisedTwoLinkArm(eqx.Module):
         """The arm of these parameters."""
         values, first = {}, 0
         for field, _, count in _FIELDS:
-            part = jnp.exp(parameters[first : first + max(count, 1)])
+            part = parameters[first : first + max(count, 1)]
             values[field] = part if count else part[0]
             first += max(count, 1)
         return TwoLinkFlexibleArm(link_lengths=self.link_lengths, **values)
@@ -55,8 +55,8 @@ def two_link_arm_gray_box(
 ) -> GrayBoxLPV:
     """An LPV model of a two-link flexible arm in its physical parameters, κ = cos θ2.
 
-    The parameters are the logarithms of ρ, EI, J, m_j, m_p and Λ; the lengths are known. Records
-    of velocity references and velocities show masses, stiffnesses and gains only up to one common
+    The parameters are ρ, EI, J, m_j, m_p and Λ in SI units; the lengths are known. Records of
+    velocity references and velocities show masses, stiffnesses and gains only up to one common
     factor: fix one of them, such as a gain, when refining.
 
     Args:
@@ -69,12 +69,12 @@ def two_link_arm_gray_box(
         >>> from lpvid.mechanics import reference_two_link_arm
         >>> model = two_link_arm_gray_box(reference_two_link_arm())
         >>> model.parameter_names[-1], model.at(0.0).nx
-        ('log velocity gain 2', 6)
+        ('velocity gain 2', 6)
     """
     names, values = [], []
     for field, name, count in _FIELDS:
-        names += [f"log {name} {i + 1}" for i in range(count)] or [f"log {name}"]
-        values.append(jnp.log(jnp.atleast_1d(getattr(start, field))))
+        names += [f"{name} {i + 1}" for i in range(count)] or [name]
+        values.append(jnp.atleast_1d(getattr(start, field)))
     kappas = np.cos(np.asarray(theta2, float))
     return GrayBoxLPV(
         LinearisedTwoLinkArm(start.link_lengths),
