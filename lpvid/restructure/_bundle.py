@@ -18,7 +18,7 @@ from lpvid.restructure._local_model import (
     model_directions,
 )
 from lpvid.restructure._matching import Target, response_error, scaling
-from lpvid.restructure._peaks import Peaks, Places, error_at, find_peaks
+from lpvid.restructure._peaks import Peaks, Places, error_at, find_peaks, join_places
 from lpvid.restructure._quadratic import Rows, join_rows, minimise_level
 
 # Proximity control: shares of the promised decrease, and what they do to the proximal weight.
@@ -33,10 +33,14 @@ _ROUNDING = 1e-12
 
 
 class Descent(NamedTuple):
-    """Result of the non-smooth stage: the best point, its peaks, the scaling and the trials."""
+    """Result of the non-smooth stage: the best point, its peaks, the scaling and the trials.
+
+    `others` are the peaks of the last trial that was refused: a climb to the peaks may miss one.
+    """
 
     value: Float[Array, " parameter"]
     peaks: Peaks
+    others: Places
     scaling: Float[Array, "parameter direction"]
     steps: Int[Array, ""]
 
@@ -44,6 +48,7 @@ class Descent(NamedTuple):
 class _State(NamedTuple):
     point: Float[Array, " parameter"]
     peaks: Peaks
+    others: Places
     trial: Float[Array, " parameter"]
     step: Float[Array, " direction"]
     promised: Scalar
@@ -168,9 +173,9 @@ def descend_nonsmooth(
     """Minimise ‖Σ(ϑ)‖∞ from `start` to a point where zero is a subgradient.
 
     The bundle is one of frequencies: the peaks of the error at the best point and those of the
-    last trial. Their cutting planes (equations 19 and 20, also along the singular vectors that the
-    local model turns to), the tangent planes of a trial that was refused and the aggregate of the
-    last program make the piecewise linear model; its step minimises the model plus a quadratic,
+    last trial that was refused. Their cutting planes (equations 19 and 20, also along the singular
+    vectors that the local model turns to), the tangent planes of that trial and the aggregate of
+    the last program make the piecewise linear model; its step minimises the model plus a quadratic,
     half Hessian of the Lagrangian and half proximal weight, which falls after steps as good as
     promised and rises after others (P. Apkarian, D. Noll, O. Prot, J. Convex Anal. 16 (2009)
     641-666). Bounds are constraints of the program, so a solution may lie on them. Steps to
@@ -204,8 +209,16 @@ def descend_nonsmooth(
         point = jnp.where(accepted, state.trial, state.point)
         peaks = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), tried, state.peaks)
 
-        both = zip(peaks.places, tried.places, strict=True)
-        places = Places(*(jnp.concatenate(pair) for pair in both))
+        # Kept after a trial that was accepted: what refused one trial may refuse the next.
+        finite = jnp.isfinite(tried.norm)
+        seen = (accepted & ~first) | ~finite
+        others = Places(
+            *(
+                jnp.where(seen, old, new)
+                for old, new in zip(state.others, tried.places, strict=True)
+            )
+        )
+        places = join_places(peaks.places, others)
         count = places.omega.shape[0]
         error = error_at(structure, point, shape, target, places)
         # The aggregate belongs to the local model of a point: it goes when the point does.
@@ -218,7 +231,7 @@ def descend_nonsmooth(
                 error_at(structure, state.trial, shape, target, tried.places), n, count // 2
             )._replace(top=model.top),
             state.step,
-            ~accepted & jnp.isfinite(tried.norm),
+            ~accepted & finite,
             _homes(tried.places, peaks.places),
         )
         step = _solve_model(error, model, refused, limits, state.metric, weight, stationary)
@@ -230,6 +243,7 @@ def descend_nonsmooth(
         return _State(
             point=point,
             peaks=peaks,
+            others=others,
             trial=jnp.clip(point + shape @ step.x, lower, upper),
             step=step.x,
             promised=step.promised,
@@ -242,9 +256,11 @@ def descend_nonsmooth(
         )
 
     unknown = jax.eval_shape(lambda: find_peaks(structure, start, target, stable))
+    begun = jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), unknown)
     state = _State(
         point=start,
-        peaks=jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), unknown),
+        peaks=begun,
+        others=begun.places,
         trial=start,
         step=jnp.zeros(n),
         promised=jnp.asarray(0.0),
@@ -256,4 +272,4 @@ def descend_nonsmooth(
         ended=jnp.asarray(False),
     )
     found = jax.lax.while_loop(lambda s: (s.steps < steps + 1) & ~s.ended, advance, state)
-    return Descent(found.point, found.peaks, shape, found.steps - 1)
+    return Descent(found.point, found.peaks, found.others, shape, found.steps - 1)

@@ -15,7 +15,7 @@ from lpvid.restructure._local_model import (
     gram_eigenvectors,
 )
 from lpvid.restructure._matching import Target
-from lpvid.restructure._peaks import error_at
+from lpvid.restructure._peaks import error_at, join_places
 from lpvid.restructure._quadratic import join_rows, minimise_level
 
 # A bound counts as reached within this share of a unit step.
@@ -36,8 +36,8 @@ class Certificate(eqx.Module):
     Attributes:
         distance: length of the shortest subgradient.
         tolerance: what it has to stay below; gains within this share of the norm are active.
-        frequencies: peaks of the gain, rad/s; the last is far beyond all poles unless a grid is
-            the target.
+        frequencies: peaks of the gain, rad/s, at the point and at the last trial that was refused;
+            the last of each is far beyond all poles unless a grid is the target.
         gains: largest singular value at each.
         active: which of them are within the tolerance of the norm.
         multipliers: weight of each frequency in the shortest subgradient; they sum to one.
@@ -70,9 +70,11 @@ def certify(
     point, shape = descent.value, descent.scaling
     bounds = Bounds(*structure.bounds())
     peaks = descent.peaks
-    count, n = peaks.gains.shape[0], point.shape[0]
-    model = expand(error_at(structure, point, shape, target, peaks.places), n, count)
-    active = peaks.gains >= (1.0 - tolerance) * peaks.norm
+    places = join_places(peaks.places, descent.others)
+    count, n = places.omega.shape[0], point.shape[0]
+    model = expand(error_at(structure, point, shape, target, places), n, count)
+    gains = jnp.sqrt(model.gains[:, 0])
+    active = gains >= (1.0 - tolerance) * peaks.norm
     leading = jnp.sqrt(model.gains / model.top) >= 1.0 - tolerance
     dtype = model.slopes.dtype
     turns = 1 if model.error.shape[2] == 1 else _TURNS
@@ -110,8 +112,8 @@ def certify(
     return Certificate(
         distance=distance,
         tolerance=jnp.asarray(tolerance),
-        frequencies=peaks.places.omega,
-        gains=peaks.gains,
+        frequencies=places.omega,
+        gains=gains,
         active=active,
         multipliers=multipliers,
         at_bound=jnp.minimum(upper, lower) <= reach,

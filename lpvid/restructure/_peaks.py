@@ -33,6 +33,11 @@ class Places(NamedTuple):
     line: Int[Array, " place"]
 
 
+def join_places(first: Places, second: Places) -> Places:
+    """The places of both."""
+    return Places(*(jnp.concatenate(pair) for pair in zip(first, second, strict=True)))
+
+
 class Peaks(NamedTuple):
     """The highest local maxima of the error's gain.
 
