@@ -65,7 +65,8 @@ def run_batch(
 
     Raises:
         ValueError: the checkpoint belongs to other runs or is damaged, or a count is too small.
-        KeyboardInterrupt: as pressed, once the chunks under way are finished and saved.
+        KeyboardInterrupt: as pressed; with several threads on a CPU once the chunks under way are
+            finished and saved.
 
     Example:
         >>> run_batch(lambda shared, index: shared * index, jnp.asarray(2), 4).tolist()

@@ -17,7 +17,7 @@ _WORDS = (
     (r"\border=(?=\d)", "--order "),
     (r'\border="auto"', "--order auto"),
     (r"\bblock_rows\b", "--block-rows"),
-    (r"\buse past outputs as instruments\b", "use --method po-moesp"),
+    (r"\buse past outputs as instruments \(PastOutputMOESP\)", "use --method po-moesp"),
     (r"call the reader that fits, read_csv, read_mat or read_npz", "name it by its kind"),
     (r"data\.select\(inputs=\.\.\.\)", "another --input"),
     (r"data\.select\(outputs=\.\.\.\)", "another --output"),

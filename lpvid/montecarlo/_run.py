@@ -111,6 +111,7 @@ def run(
     pytree of arrays; JAX traces it, so it must not look at values in Python. Where its result has a
     `status` (an attribute or an entry of that name), a run that did not succeed counts as failed;
     so does one with a NaN or an infinity. Failed runs are NaN and have a status; they stop nothing.
+    What raises at run time (`eqx.error_if`) does stop the study.
 
     Run r at point i gets the key `fold_in(keys[r], i)` (`keys[r]` without points), so its result
     depends neither on the number of devices and processes nor on the chunks; rounding apart, which
@@ -125,7 +126,7 @@ def run(
         chunk: runs of one compiled call; a sensible number by default.
         checkpoint: file to which finished runs are saved after each chunk, whole or not at all; a
             later call with the same arguments goes on from there. An interruption from the keyboard
-            saves the chunks under way and is raised again.
+            is raised again; with several threads on a CPU the chunks under way are saved first.
         progress: whether to show a bar on stderr.
 
     Returns:
@@ -197,7 +198,15 @@ def _own_status(outcome: PyTree) -> Status | None:
         found = outcome.get("status")
     else:
         found = getattr(outcome, "status", None)
-    return found if isinstance(found, Status) else None
+    if not isinstance(found, Status):
+        return None
+    shapes = {jnp.shape(leaf) for leaf in jax.tree.leaves(found)}
+    if shapes != {()}:
+        raise ValueError(
+            f"pipeline: its status must be one a run, got shape {shapes.pop()}; summarise it, or "
+            "leave it out of the result."
+        )
+    return found
 
 
 def _check_keys(keys: Any) -> None:

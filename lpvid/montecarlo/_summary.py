@@ -112,6 +112,8 @@ def summarise(
         >>> round(float(summary.ratio), 6), round(float(summary.success), 2)
         (1.0, 0.67)
     """
+    if np.iscomplexobj(samples):
+        raise ValueError("samples: complex; summarise real and imaginary parts, or size and angle.")
     values = np.asarray(samples, float)
     if values.ndim == 0:
         raise ValueError("samples: an axis of runs is needed, got a single number.")
@@ -126,6 +128,8 @@ def summarise(
     if truth is None and (bound is not None or deviation is not None):
         raise ValueError("truth: a bound or deviations say nothing without it; give it too.")
     place, quantity = mask.shape[:-1], values.shape[mask.ndim :]
+    if 0 in quantity:
+        raise ValueError(f"samples: a quantity of no entries, shape {quantity}, has no summary.")
     labels = _names(names, quantity)
     shape = (*place, *quantity)
     true = None if truth is None else _fitting("truth", truth, shape)

@@ -77,7 +77,7 @@ class NormalEquations(AbstractQuadratic):
 
     @property
     def least_damping(self) -> float:
-        """Twice the square root of rounding, roughly: the matrix is squared."""
+        """Directions that 1e-5 of the strongest shows are told apart: the matrix is squared."""
         return 1e-10
 
     def step(self, damping: Float[Array, ""], held: Bool[Array, " shared"]) -> Unknowns:

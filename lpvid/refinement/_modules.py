@@ -140,5 +140,11 @@ class ModuleParameterisation(AbstractParameterisation):
 
 
 def takes_schedule(model: Any) -> bool:
-    """Whether a module's `simulate` wants κ."""
+    """Whether a module's `simulate` can use κ."""
     return "kappa" in inspect.signature(model.simulate).parameters
+
+
+def needs_schedule(model: Any) -> bool:
+    """Whether it cannot do without."""
+    parameter = inspect.signature(model.simulate).parameters.get("kappa")
+    return parameter is not None and parameter.default is inspect.Parameter.empty

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from lpvid.data import IOData
 from lpvid.identify import ContinuousTimeFit, Fit, MechanicalFit, StepResponseFit
 from lpvid.models import FreeStructure, StateSpace, StructuredModel, balancing
-from lpvid.refinement._modules import ModuleParameterisation, takes_schedule
+from lpvid.refinement._modules import ModuleParameterisation, needs_schedule
 from lpvid.refinement._parameterisation import (
     AbstractParameterisation,
     LinearParameterisation,
@@ -60,7 +60,8 @@ def recognise(model: Any, data: IOData, predictor: AbstractPredictor) -> Start:
         return _module(model, data, estimates_gain)
     raise ValueError(
         f"model: {type(model).__name__} cannot be refined; give a StateSpace, a Fit, a "
-        "StructuredModel, an LPVStateSpace or an eqx.Module with simulate(u=, dt=, x0=)."
+        "StructuredModel, an LPVStateSpace, a GrayBoxLPV or an eqx.Module with "
+        "simulate(u=, dt=, x0=)."
     )
 
 
@@ -165,8 +166,14 @@ def _per_record(data: IOData) -> list[np.ndarray]:
 def _module(model: Any, data: IOData, estimates_gain: bool) -> Start:
     if estimates_gain:
         raise ValueError("predictor: Innovation() is for linear models of constant matrices.")
-    if data.kappa is None and takes_schedule(model):
+    if data.kappa is None and needs_schedule(model):
         raise ValueError("data: an LPV model needs the scheduling; give kappa= to IOData.")
+    dt = getattr(model, "dt", 0.0)
+    if isinstance(dt, float) and dt > 0.0 and not np.isclose(dt, data.dt, rtol=1e-9):
+        raise ValueError(
+            f"model has dt={dt}, the data dt={data.dt}: give the model in continuous time, or "
+            "check the data's sample time."
+        )
     states = int(getattr(model, "n_states", getattr(model, "nx", 0)))
     kind = ModuleParameterisation(model, data.dt, states, _schedules(data))
     if not kind.names:

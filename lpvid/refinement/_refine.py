@@ -58,8 +58,9 @@ def refine(
         model: what `identify`, `identify_mechanical`, `identify_step_response` or `refine` returned
             (an output offset is taken out of the data and kept as it is), a `StateSpace` (discrete
             at the data's sample time, or continuous: zero-order hold), `StructuredModel`,
-            `LPVStateSpace` (its coefficients, along the data's `kappa`), or any `eqx.Module` with
-            `simulate(u=, dt=, x0=)`, whose inexact arrays are the parameters and whose `n_states`
+            `LPVStateSpace` (its coefficients, along the data's `kappa`), `GrayBoxLPV` (its
+            parameters), or any `eqx.Module` with `simulate(u=, dt=, x0=)`, and `kappa=` where it
+            takes one, whose inexact arrays are the parameters and whose `n_states`
             (or `nx`) says how long x0 is; without it, x0 is not passed.
         data: one or several records.
         predictor: `OutputError()` by default, or `Innovation()`.

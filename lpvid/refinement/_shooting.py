@@ -261,9 +261,10 @@ def cut_up(records: Record, mask: Array, length: int, overlap: int) -> Pieces:
     places = np.arange(count)[:, None] * size + np.arange(size + overlap)[None, :]
     missing = int(places.max()) + 1 - longest
 
-    def cut(signal: Array) -> Array:
-        padded = jnp.pad(signal, ((0, 0), (0, missing), (0, 0)))
-        return padded[:, places]
+    def cut(signal: Array, mode: str = "constant") -> Array:
+        return jnp.pad(signal, ((0, 0), (0, missing), (0, 0)), mode=mode)[:, places]
 
+    # As in `padded_records`: the schedule stays where it was, signals end.
+    kappa = None if records.kappa is None else cut(records.kappa, "edge")
     joined = jnp.pad(mask[:, np.arange(1, count) * size], ((0, 0), (0, 1)))
-    return Pieces(jax.tree.map(cut, records), joined)
+    return Pieces(Record(cut(records.u), cut(records.y), kappa), joined)

@@ -38,7 +38,7 @@ class Identification(eqx.Module):
     """A pipeline: noise onto a record, PI-MOESP, continuous time (001, section 3.3.1).
 
     Attributes:
-        template: a record of the study without scheduling; its signals are replaced.
+        template: a record of the study; its signals are replaced, its schedule is not looked at.
     """
 
     template: IOData

@@ -73,6 +73,30 @@ def test_the_schedule_is_asked_for():
         refine(model(TRUTH), data)
 
 
+def test_another_sample_time_is_refused():
+    discrete = model(TRUTH).lpv.discretise(DT)
+    for data in (STILL[0], MOVING):
+        slower = IOData(u=data.u, y=data.y, dt=2 * DT, kappa=data.kappa)
+        with pytest.raises(ValueError, match="sample time"):
+            refine(discrete, slower)
+
+
+@pytest.mark.slow
+def test_shooting_never_leaves_the_schedule():
+    def lag(parameters, kappa):
+        return StateSpace(-parameters[:1, None] / kappa[0], parameters[1:, None], jnp.eye(1))
+
+    plant = GrayBoxLPV(lag, [2.0, 1.0], ("rate", "gain"), kappa_low=1.0, kappa_high=2.0)
+    u, schedule = inputs(210), np.linspace(1.0, 2.0, 210)
+    y = np.asarray(plant.simulate(u=u, kappa=schedule, dt=DT))
+    y = y + 0.01 * np.random.default_rng(3).standard_normal(y.shape)
+    data = IOData(u=u, y=y, dt=DT, kappa=schedule)
+    start = GrayBoxLPV(lag, [1.5, 0.7], ("rate", "gain"), kappa_low=1.0, kappa_high=2.0)
+    whole, pieces = (refine(start, data, predictor=OutputError(k)) for k in (None, 25))
+    assert pieces.status == Status.successful
+    np.testing.assert_allclose(pieces.parameters, whole.parameters, rtol=1e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("records", [STILL, [*STILL, MOVING]], ids=["still", "mixed"])
 def test_parameters_from_records_of_different_lengths(records):
