@@ -160,7 +160,7 @@ def _excess(rates: Array) -> Array:
     size = jnp.maximum(size, 1e-3 * jnp.max(size, axis=-1, keepdims=True) + jnp.finfo(float).tiny)
     margin = 0.1 * jnp.exp(jnp.mean(jnp.log(size), axis=-1))
     stable = edge < -1e-3 * jnp.max(size, axis=-1)
-    return lax.stop_gradient(jnp.where(stable, 0.0, edge + margin))
+    return lax.stop_gradient(jnp.where(stable, 0.0, jnp.maximum(edge + margin, 0.0)))
 
 
 def excess_growth(A: Float[Array, "*batch n n"]) -> Float[Array, "*batch"]:

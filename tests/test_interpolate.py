@@ -350,3 +350,16 @@ def test_one_point_cannot_be_left_out():
 def test_unstable_models_have_no_balanced_form():
     with pytest.raises(ValueError, match=r"point\(s\) \[0\]"):
         interpolate_balanced([StateSpace([[1.0]], [[1.0]], [[1.0]]), *FREE], [0, 1, 2, 3])
+
+
+def test_integrators_are_judged_where_their_response_is_finite():
+    models = [StateSpace([[0.0]], [[k]], [[1.0]]) for k in (1.0, 2.0, 3.0, 4.0)]
+    errors = leave_one_out(models, [1.0, 2.0, 3.0, 4.0])
+    assert all(np.isfinite(error) for error in errors.values())
+    assert errors[1] < 1e-9 < errors[0]
+
+
+def test_points_that_are_no_numbers_are_refused():
+    models = [StateSpace([[-k]], [[1.0]], [[1.0]]) for k in (1.0, 2.0)]
+    with pytest.raises(ValueError, match="NaN or infinity among"):
+        interpolate(models, [0.0, np.nan], Polynomial(degree=1))

@@ -117,7 +117,9 @@ def modal_along(models: Sequence[StateSpace], kappas: ArrayLike | Sequence) -> l
     for each mode over all points. The two free numbers of each mode's basis are chosen for B and C
     next to the neighbour's. Interpolated entry by entry, a mode's frequency and damping are smooth
     in κ, whether its poles are complex or real, and between two stable points (linearly in κ) every
-    frozen model is stable.
+    frozen model is stable. Where a complex pair turns real among other real poles, the pairing may
+    change from one point to the next, and the entries are not smooth there: look at
+    `leave_one_out`, and use `align_along` if it is poor.
 
     Lists and sorts numbers: runs eagerly, outside `jit`, `vmap` and `grad`.
 

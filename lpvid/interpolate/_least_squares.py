@@ -26,7 +26,9 @@ def point_weights(weights: ArrayLike | Sequence | None, count: int) -> Weights:
     """
     values = jnp.ones(count) if weights is None else jnp.asarray(weights, float)
     known = not isinstance(values, Tracer)
-    if values.shape != (count,) or (known and not bool(jnp.all(values > 0))):
+    if values.shape != (count,) or (
+        known and not bool(jnp.all((values > 0) & jnp.isfinite(values)))
+    ):
         raise ValueError(f"weights: {count} positive numbers are needed, one for each model.")
     return values
 

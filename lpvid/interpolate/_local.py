@@ -42,6 +42,8 @@ def operating_points(kappas: ArrayLike | Sequence, count: int) -> Points:
         raise ValueError(
             f"kappas: one row for each of the {count} models is needed, got shape {points.shape}."
         )
+    if not np.all(np.isfinite(points)):
+        raise ValueError("kappas: NaN or infinity among the operating points; leave those out.")
     return points
 
 
@@ -120,9 +122,11 @@ def responses(structure: AbstractStructure, parameters: Float[Array, "point para
     def one(values):
         model = structure.matrices(values)
         size = jnp.sort(model.modes().frequency)
-        slow = jnp.maximum(size[0], 1e-3 * size[-1])
-        spaced = jnp.exp(jnp.linspace(jnp.log(slow / 10.0), jnp.log(3.0 * size[-1]), 60))
-        omega = jnp.concatenate([spaced, size])
+        fast = jnp.where(size[-1] > 0.0, size[-1], 1.0)
+        slow = jnp.maximum(size[0], 1e-3 * fast)
+        spaced = jnp.exp(jnp.linspace(jnp.log(slow / 10.0), jnp.log(3.0 * fast), 60))
+        # Not at a frequency of zero, where an integrator's response is infinite.
+        omega = jnp.concatenate([spaced, jnp.maximum(size, slow / 10.0)])
         if model.is_discrete:
             omega = jnp.minimum(omega, jnp.pi / model.dt)
         return omega, model.frequency_response(omega)

@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike, Float
 
 from lpvid._files import write_atomically
 from lpvid.io._json import ModelFileError
-from lpvid.models import LPVStateSpace, PolynomialBasis, StateSpace
+from lpvid.models import GrayBoxLPV, LPVStateSpace, PolynomialBasis, StateSpace
 
 _NAMES = ("A", "B", "C", "D")
 # Relative: entries that are polynomials in κ reproduce the frozen models to rounding.
@@ -44,7 +44,7 @@ G = lpvss({parameters}, @modelData, s.dt);
 
 
 def save_mat(
-    path: str | os.PathLike[str], lpv: LPVStateSpace, kappas: ArrayLike | Sequence
+    path: str | os.PathLike[str], lpv: LPVStateSpace | GrayBoxLPV, kappas: ArrayLike | Sequence
 ) -> Path:
     """Write an LPV model, frozen on a grid, to a MATLAB file laid out for `ss`, `lpvss` and kin.
 
@@ -76,6 +76,7 @@ def save_mat(
     """
     from scipy.io import savemat
 
+    lpv = lpv.lpv if isinstance(lpv, GrayBoxLPV) else lpv
     grid = np.asarray(kappas, float)
     grid = grid[:, None] if grid.ndim == 1 else grid
     if grid.ndim != 2 or grid.shape[1] != lpv.n_scheduling or not len(grid):

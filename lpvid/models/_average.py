@@ -249,7 +249,11 @@ def _fitted(start, systems, usable, omega, weights, max_steps) -> StateSpace:
 
     start_steps = jnp.zeros(sum(leaf.size for leaf in leaves))
     found = least_squares(residual, start_steps, max_steps=max_steps)
-    return moved(found.value)
+    fitted = moved(found.value)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(fitted)]))
+    # A fit that failed, or lost stability, is no better than where it began.
+    kept = finite & (fitted.is_stable() | ~start.is_stable())
+    return jax.tree.map(lambda new, old: jnp.where(kept, new, old), fitted, start)
 
 
 def _grid(model: StateSpace, count: int) -> Float[Array, " frequency"]:

@@ -73,7 +73,8 @@ def convex_hull(points: Numbers) -> ConvexHull:
     centre, half = (low + high) / 2.0, np.where(high > low, (high - low) / 2.0, 1.0)
     scaled = (values - centre) / half
     origin = scaled.mean(axis=0)
-    _, sizes, directions = np.linalg.svd(scaled - origin)
+    # Of the triangle alone: many points would make a square matrix of their number.
+    _, sizes, directions = np.linalg.svd(np.linalg.qr(scaled - origin, mode="r"))
     rank = int(np.sum(sizes > _FLAT * max(sizes[0], 1.0)))
     along, across = directions[:rank], directions[rank:]
     inner, inner_offsets = _facets((scaled - origin) @ along.T)

@@ -17,15 +17,17 @@ from lpvid.models._connected import (
     Parallel,
     Series,
 )
+from lpvid.models._gray_box_lpv import GrayBoxLPV
 from lpvid.models._hull import ConvexHull
 from lpvid.models._lpv import LPVStateSpace
 from lpvid.models._scheduling import JoinedBasis
 from lpvid.models._state_space import StateSpace
 
-Model: TypeAlias = StateSpace | LPVStateSpace
+Model: TypeAlias = StateSpace | LPVStateSpace | GrayBoxLPV
+Connected: TypeAlias = StateSpace | LPVStateSpace
 
 
-def series(first: Model, second: Model) -> Model:
+def series(first: Model, second: Model) -> Connected:
     """The second model driven by the output of the first.
 
     Of LPV models, and of LPV and LTI ones, the result is an `LPVStateSpace` whose structure holds
@@ -51,7 +53,7 @@ def series(first: Model, second: Model) -> Model:
     return _connected(Series(), first, second)
 
 
-def parallel(first: Model, second: Model, sign: int = 1) -> Model:
+def parallel(first: Model, second: Model, sign: int = 1) -> Connected:
     """Both models driven by one input, their outputs added (or subtracted).
 
     Args:
@@ -73,7 +75,7 @@ def parallel(first: Model, second: Model, sign: int = 1) -> Model:
     return _connected(Parallel(sign), first, second)
 
 
-def feedback(forward: Model, back: Model, sign: int = -1) -> Model:
+def feedback(forward: Model, back: Model, sign: int = -1) -> Connected:
     """A closed loop: the output of `forward` returns to its input through `back`.
 
     Args:
@@ -96,9 +98,12 @@ def feedback(forward: Model, back: Model, sign: int = -1) -> Model:
     return _connected(Feedback(sign), forward, back)
 
 
-def _connected(connection: AbstractConnection, first: Model, second: Model) -> Model:
+def _connected(connection: AbstractConnection, first: Model, second: Model) -> Connected:
     if isinstance(first, StateSpace) and isinstance(second, StateSpace):
         return connection.connect(first, second)
+    first, second = (
+        model.lpv if isinstance(model, GrayBoxLPV) else model for model in (first, second)
+    )
     dts = first.dt, second.dt
     if not math.isclose(*dts, rel_tol=1e-9):
         raise ValueError(
@@ -129,7 +134,7 @@ def _connected(connection: AbstractConnection, first: Model, second: Model) -> M
     return connected
 
 
-def _structure(model: Model):
+def _structure(model: Connected):
     if isinstance(model, LPVStateSpace):
         return model.structure
     if model.batch_shape:

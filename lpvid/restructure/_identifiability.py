@@ -160,12 +160,20 @@ def identifiability(
             f"parameters: {structure.n_parameters} finite numbers are needed, see "
             f"structure.parameter_names; got shape {point.shape}."
         )
+    if omega is None and structure.matrices(point).is_discrete:
+        raise ValueError("omega: frequencies are needed for a structure in discrete time, rad/s.")
     if omega is None:
         grid = make_target(structure.matrices(point), 60, np.inf).omega
     else:
         grid = jnp.atleast_1d(jnp.asarray(omega, float))
     lower, upper = (np.asarray(bound) for bound in structure.bounds())
     free = np.flatnonzero(upper > lower)
+    if not np.all(np.isfinite(grid)):
+        raise ValueError(
+            "omega: no grid follows from poles at zero alone; give frequencies, rad/s."
+        )
+    if free.size == 0:
+        raise ValueError("structure: its bounds leave no parameter free.")
     sizes = _sizes(np.asarray(point))
     shares = (np.asarray(_jacobian(structure, point, grid)) * sizes[None])[:, free]
     length = np.linalg.norm(shares, axis=0)

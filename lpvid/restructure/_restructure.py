@@ -199,11 +199,35 @@ def restructure_along(
         initial = jnp.stack([neighbours[0].parameters, neighbours[-1].parameters])
         again = restructure(model, structure, starts=0, initial=initial, **options)
         worse = bool(again.error_norm >= (1.0 - 1e-3) * own.error_norm)
+        if stable:
+            worse |= bool(own.model.is_stable()) and not bool(again.model.is_stable())
         improved.append(own if worse else again)
+    if bounds or fixed or tied:
+        # Their names hold at every point: parameters keep their places.
+        return improved
     for index in range(1, len(improved)):
         aligned = structure.align(improved[index].parameters, improved[index - 1].parameters)
-        improved[index] = eqx.tree_at(lambda r: r.parameters, improved[index], aligned)
+        improved[index] = _in_order(improved[index], aligned)
     return improved
+
+
+def _in_order(found: Restructured, aligned: Array) -> Restructured:
+    """A result with its parameters in another order, the certificate's with them."""
+    given = np.asarray(found.parameters)
+    order = np.array([int(np.argmin(np.abs(given - value))) for value in np.asarray(aligned)])
+    certificate = found.certificate
+    moved = eqx.tree_at(lambda r: r.parameters, found, aligned)
+    if certificate is None or np.array_equal(order, np.arange(order.size)):
+        return moved
+    if sorted(order) != list(range(order.size)):
+        # More than an order has changed (signs, say): the certificate is not of these numbers.
+        return eqx.tree_at(lambda r: r.certificate, moved, None)
+    reordered = eqx.tree_at(
+        lambda c: (c.at_bound, c.scaling),
+        certificate,
+        (certificate.at_bound[order], certificate.scaling[order]),
+    )
+    return eqx.tree_at(lambda r: r.certificate, moved, reordered)
 
 
 def _check_black_box(black_box: StateSpace, structure: AbstractStructure) -> None:
@@ -227,7 +251,11 @@ def _check_black_box(black_box: StateSpace, structure: AbstractStructure) -> Non
 
 def _grid(omega: ArrayLike | Sequence, highest: float) -> Float[Array, " frequency"]:
     grid = np.atleast_1d(np.asarray(omega, float))
-    if grid.ndim != 1 or grid.size == 0 or not np.all((grid >= 0) & (grid <= highest * (1 + 1e-9))):
+    if (
+        grid.ndim != 1
+        or grid.size == 0
+        or not np.all(np.isfinite(grid) & (grid >= 0) & (grid <= highest * (1 + 1e-9)))
+    ):
         raise ValueError(
             f"omega: frequencies from 0 to the Nyquist frequency ({highest:.4g} rad/s) are needed "
             "in a one-dimensional array."

@@ -68,6 +68,7 @@ def run_stages(
         parameters = descent.value
         history.append(descent.peaks.norm)
     final = error_norm(structure, parameters, target)
+    forbidden = ~is_stable(structure, parameters) if stable else jnp.asarray(False)
     return Restructured(
         structure=structure,
         parameters=parameters,
@@ -77,7 +78,7 @@ def run_stages(
         hits=told.hits,
         margin=told.margin,
         history=jnp.stack(history),
-        status=_outcome(final, target, certificate),
+        status=_outcome(final, target, certificate, forbidden),
         minima=told.minima,
         certificate=certificate,
     )
@@ -96,8 +97,13 @@ def _lowest_norm(structure, matched: Solution, target, stable):
     return best[winner], values[winner], peaks[winner]
 
 
-def _outcome(final: HinfNorm, target: Target, certificate: Certificate | None) -> Status:
-    """The norm's own status, unless the zero model would have done as well."""
+def _outcome(
+    final: HinfNorm, target: Target, certificate: Certificate | None, forbidden: Array
+) -> Status:
+    """The norm's own status, unless the zero model would have done as well.
+
+    `forbidden` says that a stable model was asked for and none was found.
+    """
     size = largest_gain(weighted_response(target))
     poor = (final.value >= 0.999 * size) & (size > 0.0)
     status = final.status
@@ -105,6 +111,7 @@ def _outcome(final: HinfNorm, target: Target, certificate: Certificate | None) -
         told = (status != Status.successful) | certificate.certified
         status = Status.where(told, status, Status.uncertified)
     status = Status.where(poor, Status.poor_match, status)
+    status = Status.where(forbidden, Status.unstable, status)
     known = jnp.isfinite(final.value) | (final.status == Status.infinite_norm)
     return Status.where(known, status, Status.nonfinite)
 

@@ -29,7 +29,9 @@ def filter_model(weight: Weight | None, n_outputs: int) -> StateSpace | None:
     if weight.is_discrete or weight.batch_shape:
         raise ValueError("weight: one continuous-time model is needed; convert it by d2c.")
     if weight.nx == 0:
-        raise ValueError("weight: a constant scales all errors alike; leave it out.")
+        raise ValueError(
+            "weight: a constant has no poles to weight frequencies by; scale the channels instead."
+        )
     stable = weight.is_stable()
     if not isinstance(stable, Tracer) and not bool(stable):
         raise ValueError("weight: it is unstable; move its poles into the left half plane.")

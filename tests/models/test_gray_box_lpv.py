@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lpvid.models import GrayBoxLPV, StateSpace
+from lpvid.models import GrayBoxLPV, StateSpace, series
 
 NAMES = ("stiffness", "hardening", "damping")
 
@@ -39,3 +39,10 @@ def test_faults_are_named():
         GrayBoxLPV(spring, [4.0, 1.0], NAMES, kappa_low=0.0, kappa_high=1.0)
     with pytest.raises(ValueError, match="no range"):
         GrayBoxLPV(spring, [4.0, 1.0, 0.2], NAMES, kappa_low=1.0, kappa_high=0.0)
+
+
+def test_it_connects_like_any_other(model):
+    lag = StateSpace([[-3.0]], [[3.0]], [[1.0]])
+    both = series(model, lag).at(1.0)
+    expected = series(model.at(1.0), lag)
+    np.testing.assert_allclose(both.dc_gain(), expected.dc_gain(), rtol=1e-12)

@@ -77,3 +77,9 @@ def test_models_tell_what_lies_outside_of_the_hull_but_in_the_box():
 def test_impossible_points_are_refused(points):
     with pytest.raises(ValueError, match="points: finite values"):
         convex_hull(points)
+
+
+def test_a_whole_schedule_may_be_given():
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (20_000, 2))
+    hull = convex_hull(points)
+    assert np.all(np.asarray(hull.distance(jnp.asarray(points[:50]))) <= 1e-9)
