@@ -224,9 +224,10 @@ def test_fits_come_back_with_offsets_and_noise_models(path):
 @pytest.mark.slow
 def test_refined_and_restructured_models_come_back(path):
     model, data = _record()
+    data = eqx.tree_at(lambda record: record.y, data, data.y - 2.0)
     structure = ModalStructure(1, 1, 1, feedthrough=True)
     start = StructuredModel(structure, structure.parameters_of(model))
-    for refined in (refine(model, data, max_steps=3), refine(start, data, max_steps=3)):
+    for refined in (refine(model, data), refine(start, data)):
         loaded = load(save(path, refined))
         assert _same(loaded, refined)
         assert loaded.advice == refined.advice

@@ -160,7 +160,7 @@ def test_gradient_of_the_reduced_model():
     @jax.jit
     def along(step):
         model = StateSpace(A + step * direction, B, C, D)
-        reduced = balanced_truncation(model, 4, match_dc=match_dc).model
+        reduced = balanced_truncation(model, 4, match_dc=True).model
         return jnp.abs(reduced.frequency_response(omega))
 
     difference = (along(1e-6) - along(-1e-6)) / 2e-6
