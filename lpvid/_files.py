@@ -1,11 +1,14 @@
 """Files written whole or not at all."""
 
 import io
+import json
+import math
 import os
 import uuid
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -87,3 +90,45 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             return {name: archive[name] for name in archive.files}
     except (ValueError, EOFError, KeyError, AttributeError, TypeError, zipfile.BadZipFile) as error:
         raise ValueError(f"{os.fspath(path)}: damaged, or no archive of arrays.") from error
+
+
+def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> Path:
+    """Write figures as strict JSON, whole or not at all; a number that is not finite becomes null.
+
+    Args:
+        path: where to, see `write_atomically`.
+        content: numbers, text, arrays, and lists and mappings of them.
+
+    Returns:
+        The path given.
+
+    Raises:
+        OSError: the folder is missing or not writable.
+
+    Example:
+        >>> write_json("figures.json", {"error": np.array([0.5, np.nan])}).read_text().split()
+        ['{', '"error":', '[', '0.5,', 'null', ']', '}']
+    """
+    text = json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return write_atomically(path, text.encode())
+
+
+def plain(value: Any) -> Any:
+    """Arrays as lists, numbers that are not finite as `None`: what strict JSON can hold.
+
+    Args:
+        value: a number, text, an array, or lists and mappings of them.
+
+    Example:
+        >>> plain({"gain": np.array([1.0, np.inf])})
+        {'gain': [1.0, None]}
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return plain(np.asarray(value).tolist())

@@ -147,6 +147,9 @@ def test_the_walk_starts_in_the_middle_and_goes_to_neighbours():
         (lambda: modal_along([two_states(0.0)], [0, 1]), "kappas: one row"),
         (lambda: jax.jit(lambda m: modal_along([m, m], [0, 1]))(damped(0.0)), "needs numbers"),
         (lambda: modal_along([JORDAN, JORDAN], [0, 1]), "point 0 cannot be told apart"),
+        (lambda: modal_along([TWINS, TWINS], [0, 1]), r"equal real poles \(-2 rad/s\) at point 0"),
+        (lambda: modal_along([DELAY, DELAY], [0, 1]), "at point 0 .a delay of whole samples"),
+        (lambda: modal_along([INTEGRATOR] * 2, [0, 1]), "a pole at zero at point 0"),
         (
             lambda: align_along([damped(0.0), StateSpace(40 * np.eye(3), *FULL)], [0, 1]),
             r"too unstable at point\(s\) \[1\]",
@@ -159,4 +162,7 @@ def test_impossible_families_are_refused(make, message):
 
 
 FULL = np.ones((3, 1)), np.ones((2, 3))
+TWINS = StateSpace(np.diag([-2.0, -2.0, -5.0]), *FULL)
+DELAY = StateSpace(np.diag([0.5, 0.2, 0.0]), *FULL, dt=0.1)
+INTEGRATOR = StateSpace(np.diag([0.0, -1.0, -5.0]), *FULL)
 JORDAN = StateSpace(-np.eye(4) + np.eye(4, k=1), np.ones((4, 1)), np.ones((1, 4)))

@@ -81,8 +81,13 @@ def _single(A, B, C, D, *, dt: float, count: int, eigensolver: AbstractEigensolv
     omega, width = candidates(form)
     ordered = jnp.sort(omega)
     middle = 0.5 * (ordered[1:] + ordered[:-1])
-    omega = jnp.concatenate([jnp.where(jnp.isfinite(top), top, 0.0)[None], omega, middle])
-    width = jnp.concatenate([jnp.zeros(1), width, 0.25 * (ordered[1:] - ordered[:-1])])
+    imag, rate = form.poles.imag, jnp.abs(form.poles.real)
+    # A difference of two nearly equal modes has a peak on either side of them, none at the top.
+    flanks = jnp.abs(jnp.abs(imag) + jnp.where(imag > 0.0, rate, -rate))
+    omega = jnp.concatenate([jnp.where(jnp.isfinite(top), top, 0.0)[None], omega, middle, flanks])
+    width = jnp.concatenate(
+        [jnp.zeros(1), width, 0.25 * (ordered[1:] - ordered[:-1]), 0.25 * rate]
+    )
     omega, squared = lax.cond(
         trustworthy(form),
         lambda start: refine_peaks(form, start[0], start[1], 12),

@@ -10,11 +10,12 @@ import numpy as np
 from tqdm import tqdm
 
 from lpvid import __version__
+from lpvid._files import write_json
 from lpvid.commands._cache import keep_compiled_code
 from lpvid.commands._demo_figures import FIGURES
 from lpvid.commands._demo_tables import SETTING, tables
 from lpvid.commands._messages import Warnings
-from lpvid.commands._output import make_folder, write_json
+from lpvid.commands._output import make_folder
 from lpvid.plot import save_figure
 from lpvid.report import Report, text_table
 from lpvid.study import StudyResult, run_study, summary

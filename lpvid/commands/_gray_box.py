@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpvid import __version__
+from lpvid._files import plain, write_json
 from lpvid._results import Status
 from lpvid.analysis import propagate
 from lpvid.commands._cache import keep_compiled_code
 from lpvid.commands._errors import UsageError
 from lpvid.commands._messages import Warnings
-from lpvid.commands._output import NORMAL_95, check_targets, plain, write_json
+from lpvid.commands._output import NORMAL_95, check_targets
 from lpvid.commands._records import check_columns, offsets_of, read_records, without_offsets
 from lpvid.data import IOData
 from lpvid.identify import (

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from lpvid import __version__
+from lpvid._files import write_json
 from lpvid._results import Status, is_successful
 from lpvid.analysis import hinf_norm
 from lpvid.commands._cache import keep_compiled_code
@@ -20,7 +21,6 @@ from lpvid.commands._lpv_arguments import check, groups_of, numbers
 from lpvid.commands._lpv_refine import refine_all
 from lpvid.commands._lpv_tables import print_all, written
 from lpvid.commands._messages import Warnings, say
-from lpvid.commands._output import write_json
 from lpvid.commands._records import (
     offsets_of,
     read_records,

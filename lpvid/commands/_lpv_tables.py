@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from lpvid.commands._output import plain
+from lpvid._files import plain
 from lpvid.report import text_table
 
 

@@ -15,6 +15,8 @@ _WORDS = (
     (r"\bstabilise=(?=[\d.])", "--stabilise "),
     (r"\bblock_rows=(?=\d)", "--block-rows "),
     (r"\border=(?=\d)", "--order "),
+    (r"\bsplit=(?=[\d.])", "--split "),
+    (r"\btest=(?=\W|$)", "--test"),
     (r'\border="auto"', "--order auto"),
     (r"\bblock_rows\b", "--block-rows"),
     (r"\buse past outputs as instruments \(PastOutputMOESP\)", "use --method po-moesp"),

@@ -1,15 +1,9 @@
-"""Files that the commands write: checked before the work, written whole after it."""
+"""Files that the commands write: checked before the work."""
 
-import json
-import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from lpvid._files import write_atomically
 from lpvid.commands._errors import UsageError
 
 # Half a 95 % interval in standard deviations.
@@ -50,22 +44,3 @@ def make_folder(option: str, name: str) -> Path:
     if not os.access(path, os.W_OK | os.X_OK):
         raise UsageError(f"{option}: the folder {name} cannot be written")
     return path
-
-
-def write_json(path: str | os.PathLike[str], content: dict[str, Any]) -> None:
-    """Write figures as JSON; a number that is not finite becomes null."""
-    text = json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-    write_atomically(path, text.encode())
-
-
-def plain(value: Any) -> Any:
-    """Arrays as lists, numbers that are not finite as `None`."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return plain(np.asarray(value).tolist())

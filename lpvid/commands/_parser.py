@@ -7,6 +7,7 @@ from typing import NoReturn
 
 from lpvid.commands import _values as values
 from lpvid.commands._errors import UsageError
+from lpvid.loop.structures import STRUCTURES as PORTED_STRUCTURES
 
 METHODS = ("po-moesp", "pi-moesp", "n4sid", "cva", "orse")
 CONTINUOUS_METHODS = ("continuous-moesp", "continuous-n4sid", "continuous-cva")
@@ -47,6 +48,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_gray_box(commands)
     _add_step(commands)
     _add_lpv(commands)
+    _add_close_loop(commands)
     commands.add_parser(
         "info",
         help="versions, devices, precision",
@@ -218,6 +220,54 @@ def _add_lpv(commands) -> None:
     )
     _add_seed(lpv)
     _add_files_out(lpv)
+
+
+def _add_close_loop(commands) -> None:
+    close_loop = commands.add_parser(
+        "close-loop",
+        help="what a model lacks: found, named, added; error before and after",
+        description="Fit a model to records, find what it lacks, name the effect (friction, "
+        "backlash, delay, …), add it, fit again, and say how far the error on held-out data falls; "
+        "or say that nothing is to be added, or that the records do not decide. Several files are "
+        "several experiments.",
+    )
+    close_loop.add_argument("files", nargs="+", metavar="FILE", help=".csv, .txt, .dat, .mat, .npz")
+    _add_columns(close_loop)
+    close_loop.add_argument(
+        "--schedule",
+        type=values.columns,
+        action="extend",
+        default=[],
+        metavar="COL,…",
+        help="columns of measured signals that the model's parameters may depend on",
+    )
+    close_loop.add_argument(
+        "--structure",
+        choices=PORTED_STRUCTURES,
+        metavar="NAME",
+        help=f"of the model: {', '.join(PORTED_STRUCTURES)} (black-box)",
+    )
+    close_loop.add_argument(
+        "--order", type=values.count, metavar="N", help="states of a black box or an arm (chosen)"
+    )
+    close_loop.add_argument(
+        "--model", metavar="MODEL.json", help="a saved model to start from, no structure"
+    )
+    close_loop.add_argument(
+        "--split",
+        type=values.fraction,
+        metavar="F",
+        help="share of each record to fit on; the rest is held out (0.67)",
+    )
+    close_loop.add_argument(
+        "--test",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="a held-out record; all FILEs are then fitted to",
+    )
+    close_loop.add_argument("--json", metavar="FILE", help="where to write the figures as JSON")
+    close_loop.add_argument("--html", metavar="FILE", help="where to write the report as HTML")
 
 
 def _add_columns(parser) -> None:

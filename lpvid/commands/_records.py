@@ -40,6 +40,8 @@ def check_columns(arguments: argparse.Namespace) -> None:
     """Raise where a column has two parts, or options contradict one another."""
     parts = [("--input", name) for name in arguments.input]
     parts += [("--output", name) for name in arguments.output]
+    # Only some commands have a schedule.
+    parts += [("--schedule", name) for name in getattr(arguments, "schedule", ())]
     parts += [("--time", arguments.time)] if arguments.time is not None else []
     seen: dict[str, str] = {}
     for option, name in parts:

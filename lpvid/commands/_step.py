@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpvid import __version__
+from lpvid._files import plain, write_json
 from lpvid._results import Status
 from lpvid.analysis import bft
 from lpvid.commands._cache import keep_compiled_code
 from lpvid.commands._messages import Warnings
-from lpvid.commands._output import check_targets, plain, write_json
+from lpvid.commands._output import check_targets
 from lpvid.commands._records import check_columns, read_records
 from lpvid.data import IOData
 from lpvid.identify import (

@@ -11,6 +11,8 @@ from lpvid.models import StateSpace
 # A basis worse conditioned than this stands for modes that cannot be told apart.
 _CONDITION = 1e10
 _WORST_BASIS = 1e8
+# Poles closer to zero than this, of z or as a share of the fastest, have no frequency.
+_DELAY, _INTEGRATOR = 1e-7, 1e-10
 
 
 @dataclasses.dataclass
@@ -51,10 +53,12 @@ def sections_of(model: StateSpace, neighbour: list[Section] | None, point: int) 
         point: named in messages.
 
     Raises:
-        ValueError: the modes cannot be told apart (equal poles in different modes).
+        ValueError: the modes cannot be told apart (equal poles in different modes), or one has no
+            frequency: an integrator, a delay.
     """
     A, B, C = (np.asarray(matrix) for matrix in (model.A, model.B, model.C))
     poles, vectors = np.linalg.eig(A)
+    _check_frequencies(model, poles, point)
     moved = np.log(poles.astype(complex)) / model.dt if model.is_discrete else poles
     groups = _groups(poles, moved, neighbour)
     basis = np.concatenate([_plane(poles[g], vectors[:, g], A) for g in groups], axis=1)
@@ -75,6 +79,21 @@ def sections_of(model: StateSpace, neighbour: list[Section] | None, point: int) 
         sections.append(Section(block, inputs, outputs, np.asarray(moved[group]), shape))
         start = stop
     return sections
+
+
+def _check_frequencies(model: StateSpace, poles: np.ndarray, point: int) -> None:
+    """Modes are matched and scaled by their frequencies."""
+    if model.is_discrete and np.min(np.abs(poles)) < _DELAY:
+        raise ValueError(
+            f"models: a pole at z = 0 at point {point} (a delay of whole samples) has no "
+            "frequency; shift the input by the delay and identify again, or take align_along."
+        )
+    distance = np.abs(poles - 1.0) / model.dt if model.is_discrete else np.abs(poles)
+    if np.min(distance) <= _INTEGRATOR * np.max(distance):
+        raise ValueError(
+            f"models: a pole at zero at point {point} (an integrator) has no frequency; leave it "
+            "out of the models (difference the output), or take align_along."
+        )
 
 
 def _groups(
@@ -138,11 +157,14 @@ def coherent_bases(mode: list[Section], first: int, path: list[tuple[int, int]])
         mode: the section of each point.
         first: where to begin.
         path: (point, neighbour already done).
+
+    Raises:
+        ValueError: a mode has two equal real poles with a state each, which no such block has.
     """
     width = float(np.exp(np.mean([np.log(_size(section)) for section in mode])))
-    _write(mode[first], _first_row(mode[first], width), width)
+    _write(mode[first], _first_row(mode[first], width), width, first)
     for index, neighbour in path:
-        _write(mode[index], _nearest_row(mode[index], mode[neighbour], width), width)
+        _write(mode[index], _nearest_row(mode[index], mode[neighbour], width), width, index)
 
 
 def _size(section: Section) -> float:
@@ -162,6 +184,8 @@ def _first_row(section: Section, width: float) -> np.ndarray:
     if np.linalg.cond(_basis(section, preferred, width)) < 1e3:
         row = preferred
     T = _basis(section, row, width)
+    if not np.linalg.cond(T) < _WORST_BASIS:
+        return row
     sizes = np.linalg.norm(T @ section.B), np.linalg.norm(section.C @ np.linalg.inv(T))
     return row * np.sqrt(sizes[1] / sizes[0]) if min(sizes) > 0 else row
 
@@ -178,8 +202,13 @@ def _nearest_row(section: Section, neighbour: Section, width: float) -> np.ndarr
     return row
 
 
-def _write(section: Section, row: np.ndarray, width: float) -> None:
+def _write(section: Section, row: np.ndarray, width: float, point: int) -> None:
     T = _basis(section, row, width)
+    if not np.linalg.cond(T) < _WORST_BASIS:
+        raise ValueError(
+            f"models: two equal real poles ({np.mean(np.real(section.poles)):.4g} rad/s) at point "
+            f"{point} are no mode of two states; lower the order, or take align_along."
+        )
     inverse = np.linalg.inv(T)
     section.A = T @ section.A @ inverse
     if len(row) == 2:

@@ -1,6 +1,7 @@
 """Alignment of models in a common state basis, and averages of many."""
 
 import abc
+import warnings
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -158,7 +159,8 @@ class ResponseAverage(AbstractAverage):
 
     No basis is involved in the mean, so models need not be alike enough to be aligned well. The
     fit begins at the aligned average and moves all of its entries by least squares; D stays zero
-    where it is zero in all models.
+    where it is zero in all models. Where the fit fails or loses stability the aligned average is
+    returned, with a warning (outside `jit`).
 
     Attributes:
         omega: frequencies, rad/s; when left out, `frequencies` of them around the poles of the
@@ -211,11 +213,22 @@ class ResponseAverage(AbstractAverage):
         wanted = (omega.shape[0], start.ny, start.nu)
         if self.weights is not None and self.weights.shape != wanted:
             raise ValueError(f"weights: shape {wanted} is needed, got {self.weights.shape}.")
-        return _fitted(start, systems, usable, omega, self.weights, self.max_steps), usable
+        fitted, kept = _fitted(start, systems, usable, omega, self.weights, self.max_steps)
+        if not isinstance(kept, Tracer) and np.any(usable) and not kept:
+            warnings.warn(
+                "ResponseAverage: the fit to the mean response failed or lost stability; the "
+                "aligned average is returned in its place. Give omega= where the models agree, or "
+                "leave out models that do not.",
+                stacklevel=2,
+            )
+        return fitted, usable
 
 
 @eqx.filter_jit
-def _fitted(start, systems, usable, omega, weights, max_steps) -> StateSpace:
+def _fitted(
+    start, systems, usable, omega, weights, max_steps
+) -> tuple[StateSpace, Bool[Array, ""]]:
+    """The fitted model, or `start` where it is no better, and which it is."""
     responses = systems.frequency_response(omega)
     share = usable.astype(float) / jnp.sum(usable.astype(float))
     share = share[:, None, None, None]
@@ -253,7 +266,7 @@ def _fitted(start, systems, usable, omega, weights, max_steps) -> StateSpace:
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(fitted)]))
     # A fit that failed, or lost stability, is no better than where it began.
     kept = finite & (fitted.is_stable() | ~start.is_stable())
-    return jax.tree.map(lambda new, old: jnp.where(kept, new, old), fitted, start)
+    return jax.tree.map(lambda new, old: jnp.where(kept, new, old), fitted, start), kept
 
 
 def _grid(model: StateSpace, count: int) -> Float[Array, " frequency"]:

@@ -11,6 +11,13 @@ from lpvid.plot._frequency import singular_values as singular_values
 from lpvid.plot._horizon import horizon_errors as horizon_errors
 from lpvid.plot._intervals import parameter_intervals as parameter_intervals
 from lpvid.plot._intervals import profile_likelihood as profile_likelihood
+from lpvid.plot._loop import loop as loop
+from lpvid.plot._loop_findings import candidate_ranking as candidate_ranking
+from lpvid.plot._loop_findings import error_ladder as error_ladder
+from lpvid.plot._loop_findings import virtual_forces as virtual_forces
+from lpvid.plot._loop_signals import loop_residuals as loop_residuals
+from lpvid.plot._loop_signals import loop_responses as loop_responses
+from lpvid.plot._loop_signals import loop_spectra as loop_spectra
 from lpvid.plot._parameters import parameters as parameters
 from lpvid.plot._poles import mode_frequencies as mode_frequencies
 from lpvid.plot._poles import poles as poles

@@ -31,6 +31,17 @@ FAINT = "#8C8C8C"
 # A second sign beside the colour, for print in grey.
 DASHES = ("-", (0, (6, 2)), (0, (2, 1.2)), (0, (6, 2, 1.5, 2)), (0, (9, 2, 2, 2, 2, 2)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+NOISE_FLOOR: dict[str, Any] = {
+    "color": REFERENCE_COLOUR,
+    "linestyle": DASHES[2],
+    "linewidth": 1.0,
+    "label": "noise floor",
+}
+# A model without the effects that it lacks, and with them.
+BEFORE: dict[str, Any] = {"color": COLOURS[1], "linestyle": DASHES[1]}
+AFTER: dict[str, Any] = {"color": COLOURS[0], "linestyle": DASHES[0]}
+# Inches: narrow enough that letters can be read where a phone shows the whole width.
+LOOP_WIDTH = 5.0
 
 _STYLE: dict[Any, Any] = {
     "font.size": 9.0,
@@ -135,6 +146,24 @@ def legend_above(axes: Axes) -> None:
 def with_unit(name: str, unit: str) -> str:
     """`name (unit)`, or the name alone."""
     return f"{name} ({unit})" if unit else name
+
+
+def few_decades(axis: Any) -> None:
+    """Plain numbers at 1, 2 and 5 where a logarithmic axis has few decades, not at every digit."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    if 0.0 < low < high < 2e2 * low:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def p_value_text(value: Any) -> str:
+    """A p-value in words that fit a picture."""
+    if np.isnan(value):
+        return "p unknown"
+    return "p < 0.0001" if float(value) < 1e-4 else f"p = {float(value):.3f}"
 
 
 def labelled(

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from lpvid.analysis import ResidualTests
-from lpvid.plot._figure import FAINT, colour, dress, grid_of_axes, styled
+from lpvid.plot._figure import FAINT, colour, dress, grid_of_axes, p_value_text, styled
 
 
 @styled
@@ -42,14 +42,15 @@ def residual_tests(tests: ResidualTests, *, axes: Any = None) -> np.ndarray:
         panel: Any = panels[k, 0]
         _draw(panel, np.asarray(tests.lags), np.asarray(tests.autocorrelation)[:, k], band)
         panel.set_ylabel(f"residual of {output}")
-        _title(panel, "autocorrelation", _p(tests.whiteness_p[k]))
+        _title(panel, "autocorrelation", p_value_text(tests.whiteness_p[k]))
         for j, source in enumerate(tests.input_names):
             panel = panels[k, 1 + j]
             band = np.asarray(tests.cross_band)[:, k, j]
             values = np.asarray(tests.cross_correlation)[:, k, j]
             _draw(panel, np.asarray(tests.cross_lags), values, band)
             panel.axvline(0.0, color=FAINT, linewidth=0.8)
-            found = f"{_p(tests.dynamics_p[k, j])} (lags < 0: {_p(tests.feedback_p[k, j])})"
+            dynamics, feedback = tests.dynamics_p[k, j], tests.feedback_p[k, j]
+            found = f"{p_value_text(dynamics)} (lags < 0: {p_value_text(feedback)})"
             _title(panel, f"with {source}", found)
     for panel in panels[-1]:
         panel.set_xlabel(f"lag (samples); grey: {100.0 * tests.level:g} %")
@@ -83,7 +84,3 @@ def _draw(panel: Any, lag: np.ndarray, values: np.ndarray, band: np.ndarray) -> 
 def _title(panel: Any, name: str, found: str) -> None:
     panel.set_title(name, loc="left")
     panel.set_title(found, loc="right", fontweight="normal", fontsize=8.0)
-
-
-def _p(value: Any) -> str:
-    return "p < 0.0001" if float(value) < 1e-4 else f"p = {float(value):.3f}"

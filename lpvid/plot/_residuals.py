@@ -130,12 +130,16 @@ def _draw_spectrum(
         (measured, "measured", DATA_COLOUR),
         (residual, "residual", colour(1)),
     ):
-        segment = min(signal.size, max(16, min(signal.size // 4, 1024)))
-        frequency, power = scipy.signal.welch(signal, fs=1.0 / dt, nperseg=segment)
-        shown = np.where(power[1:] > 0, power[1:], np.nan)
-        panel.plot(frequency[1:], shown, color=shade, linewidth=0.9, label=label)
+        panel.plot(*power_spectrum(signal, dt), color=shade, linewidth=0.9, label=label)
     panel.set_xscale("log")
     panel.set_yscale("log")
     density = f", ({unit})²/Hz" if unit else ""
     panel.set_title(f"power spectral density{density}", loc="left")
     legend(panel, loc="lower left")
+
+
+def power_spectrum(signal: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies in Hz, without zero, and Welch's power spectral density; NaN where it is zero."""
+    segment = min(signal.size, max(16, min(signal.size // 4, 1024)))
+    frequency, power = scipy.signal.welch(signal, fs=1.0 / dt, nperseg=segment)
+    return frequency[1:], np.where(power[1:] > 0, power[1:], np.nan)

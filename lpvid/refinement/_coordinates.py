@@ -1,6 +1,7 @@
 """Fixed and tied values, and the local coordinates of a black box."""
 
 from collections.abc import Sequence
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 
 import equinox as eqx
@@ -9,6 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 Ties = Sequence[str | Sequence[str]]
+
+_MOST_NAMES = 20
 
 
 class Selection(eqx.Module):
@@ -43,9 +46,18 @@ def matching(names: tuple[str, ...], pattern: str, argument: str) -> list[int]:
     if not found:
         raise ValueError(
             f"{argument}: no parameter is called {pattern!r} (* and ? are wildcards); there are "
-            f"{', '.join(names)}."
+            f"{_some(names, pattern)}."
         )
     return found
+
+
+def _some(names: tuple[str, ...], pattern: str) -> str:
+    """All names, or of many those most like the pattern and how many there are."""
+    if len(names) <= _MOST_NAMES:
+        return ", ".join(names)
+    alike = get_close_matches(pattern, names, n=_MOST_NAMES // 2, cutoff=0.5)
+    shown = alike + [name for name in names if name not in alike][: _MOST_NAMES - len(alike)]
+    return f"{', '.join(shown)} and {len(names) - len(shown)} more"
 
 
 def select(

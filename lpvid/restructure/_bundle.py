@@ -18,7 +18,7 @@ from lpvid.restructure._local_model import (
     model_directions,
 )
 from lpvid.restructure._matching import Target, response_error, scaling
-from lpvid.restructure._peaks import Peaks, Places, error_at, find_peaks, join_places
+from lpvid.restructure._peaks import Peaks, Places, error_at, find_peaks, join_places, plateau
 from lpvid.restructure._quadratic import Rows, join_rows, minimise_level
 
 # Proximity control: shares of the promised decrease, and what they do to the proximal weight.
@@ -54,6 +54,7 @@ class _State(NamedTuple):
     promised: Scalar
     aggregate: Rows
     metric: Float[Array, "direction direction"]
+    bend: Float[Array, "direction direction"]
     weight: Scalar
     refused: Bool[Array, ""]
     steps: Int[Array, ""]
@@ -90,13 +91,17 @@ class _Refused(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """A step of the local model: what it promises, the model's aggregate, and the next metric."""
+    """A step of the local model: what it promises, the model's aggregate, and the next metric.
+
+    `bend` is the curvature of the cuts' combination, the metric its absolute value.
+    """
 
     x: Float[Array, " direction"]
     promised: Scalar
     left: Scalar
     aggregate: Rows
     metric: Float[Array, "direction direction"]
+    bend: Float[Array, "direction direction"]
 
 
 def _solve_model(
@@ -104,11 +109,16 @@ def _solve_model(
     model: Expansion,
     refused: _Refused,
     limits: Rows,
-    metric: Array,
+    before: tuple[Array, Array],
     weight: Array,
     stationary: Array,
 ) -> _Step:
-    """Cutting planes, then the curvature that their multipliers ask for, then the step again."""
+    """Cutting planes, then the curvature that their multipliers ask for, then the step again.
+
+    `before` are the metric and the signed curvature of the last step, whose aggregate comes first
+    in `limits`.
+    """
+    metric, carried = before
     count, n = model.error.shape[0], model.slopes.shape[0]
     # One input or output has but one singular vector; else the model is met again where it turns.
     planes, rounds = (1, 2) if model.error.shape[2] == 1 else (3, 3)
@@ -127,18 +137,21 @@ def _solve_model(
         by_plane = multipliers[: planes * count].reshape(planes, count)
         later = multipliers[planes * count :][: refused.home.shape[0]]
         by_plane = by_plane.at[0, refused.home].add(later)
-        values, vectors = jnp.linalg.eigh(curvature(error, model, directions, by_plane, stationary))
+        # What the aggregate stands for bends as it did when the aggregate was made.
+        bend = curvature(error, model, directions, by_plane, stationary)
+        bend = bend + multipliers[planes * count + refused.home.shape[0]] * carried
+        values, vectors = jnp.linalg.eigh(bend)
         renewed = (vectors * jnp.abs(values)[None]) @ vectors.T
         turned = model_directions(model, found.x)
         after = (jnp.arange(planes) == index + 1)[:, None, None]
         directions = jnp.where(after, turned[None], directions)
         promised = -(found.level + 0.5 * found.x @ metric @ found.x)
         left = jnp.linalg.norm(weighted @ found.x)
-        return directions, renewed, _Step(found.x, promised, left, aggregate, renewed)
+        return directions, renewed, _Step(found.x, promised, left, aggregate, renewed, bend)
 
     zero = jnp.asarray(0.0)
     nothing = Rows(jnp.zeros((1, n)), jnp.ones(1), jnp.zeros(1))
-    unsolved = _Step(jnp.zeros(n), zero, zero, nothing, metric)
+    unsolved = _Step(jnp.zeros(n), zero, zero, nothing, metric, carried)
     directions = jnp.broadcast_to(
         model.vectors[None, :, :, 0], (planes, count, model.error.shape[2])
     )
@@ -172,14 +185,14 @@ def descend_nonsmooth(
 ) -> Descent:
     """Minimise ‖Σ(ϑ)‖∞ from `start` to a point where zero is a subgradient.
 
-    The bundle is one of frequencies: the peaks of the error at the best point and those of the
-    last trial that was refused. Their cutting planes (equations 19 and 20, also along the singular
-    vectors that the local model turns to), the tangent planes of that trial and the aggregate of
-    the last program make the piecewise linear model; its step minimises the model plus a quadratic,
-    half Hessian of the Lagrangian and half proximal weight, which falls after steps as good as
-    promised and rises after others (P. Apkarian, D. Noll, O. Prot, J. Convex Anal. 16 (2009)
-    641-666). Bounds are constraints of the program, so a solution may lie on them. Steps to
-    unstable models are refused where `stable` says so.
+    The bundle is one of frequencies: the peaks of the error at the best point, some more where its
+    gain is flat, and the peaks of the last trial that was refused. Their cutting planes (equations
+    19 and 20, also along the singular vectors that the local model turns to), the tangent planes of
+    that trial and the aggregate of the last program make the piecewise linear model; its step
+    minimises the model plus a quadratic, half Hessian of the Lagrangian and half proximal weight,
+    which falls after steps as good as promised and rises after others (P. Apkarian, D. Noll,
+    O. Prot, J. Convex Anal. 16 (2009) 641-666). Bounds are constraints of the program, so a
+    solution may lie on them. Steps to unstable models are refused where `stable` says so.
 
     Works under `jit`; a batch costs least through `jax.lax.map`.
     """
@@ -219,6 +232,8 @@ def descend_nonsmooth(
             )
         )
         places = join_places(peaks.places, others)
+        if target.black_box is not None:
+            places = join_places(places, plateau(structure, point, target, peaks, tolerance))
         count = places.omega.shape[0]
         error = error_at(structure, point, shape, target, places)
         # The aggregate belongs to the local model of a point: it goes when the point does.
@@ -228,13 +243,17 @@ def descend_nonsmooth(
         model = expand(error, n, count)
         refused = _Refused(
             expand(
-                error_at(structure, state.trial, shape, target, tried.places), n, count // 2
+                error_at(structure, state.trial, shape, target, tried.places),
+                n,
+                tried.gains.shape[0],
             )._replace(top=model.top),
             state.step,
             ~accepted & finite,
             _homes(tried.places, peaks.places),
         )
-        step = _solve_model(error, model, refused, limits, state.metric, weight, stationary)
+        step = _solve_model(
+            error, model, refused, limits, (state.metric, state.bend), weight, stationary
+        )
 
         small = 0.1 * tolerance
         certain = (step.left <= small) & (step.aggregate.limits[0] <= small)
@@ -249,6 +268,7 @@ def descend_nonsmooth(
             promised=step.promised,
             aggregate=step.aggregate,
             metric=step.metric,
+            bend=step.bend,
             weight=weight,
             refused=~accepted,
             steps=state.steps + 1,
@@ -266,6 +286,7 @@ def descend_nonsmooth(
         promised=jnp.asarray(0.0),
         aggregate=Rows(jnp.zeros((1, n)), jnp.ones(1), jnp.zeros(1)),
         metric=jnp.zeros((n, n)),
+        bend=jnp.zeros((n, n)),
         weight=jnp.asarray(_FIRST_WEIGHT),
         refused=jnp.asarray(False),
         steps=jnp.asarray(0),

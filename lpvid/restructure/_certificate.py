@@ -15,7 +15,7 @@ from lpvid.restructure._local_model import (
     gram_eigenvectors,
 )
 from lpvid.restructure._matching import Target
-from lpvid.restructure._peaks import error_at, join_places
+from lpvid.restructure._peaks import error_at, join_places, plateau
 from lpvid.restructure._quadratic import join_rows, minimise_level
 
 # A bound counts as reached within this share of a unit step.
@@ -36,8 +36,10 @@ class Certificate(eqx.Module):
     Attributes:
         distance: length of the shortest subgradient.
         tolerance: what it has to stay below; gains within this share of the norm are active.
-        frequencies: peaks of the gain, rad/s, at the point and at the last trial that was refused;
-            the last of each is far beyond all poles unless a grid is the target.
+        frequencies: peaks of the gain, rad/s, at the point and at the last trial that was refused,
+            the last of each far beyond all poles; then some, repeated where there are few, at
+            which the gain is within the tolerance of the norm. Lines of the grid where a grid is
+            the target.
         gains: largest singular value at each.
         active: which of them are within the tolerance of the norm.
         multipliers: weight of each frequency in the shortest subgradient; they sum to one.
@@ -71,6 +73,8 @@ def certify(
     bounds = Bounds(*structure.bounds())
     peaks = descent.peaks
     places = join_places(peaks.places, descent.others)
+    if target.black_box is not None:
+        places = join_places(places, plateau(structure, point, target, peaks, tolerance))
     count, n = places.omega.shape[0], point.shape[0]
     model = expand(error_at(structure, point, shape, target, places), n, count)
     gains = jnp.sqrt(model.gains[:, 0])

@@ -12,8 +12,10 @@ from lpvid.restructure._quadratic import Rows
 
 # Singular values closer than this share of the largest turn too fast for a quadratic model.
 _LEAST_SEPARATION = 0.05
+# A peak flatter than this, along the frequency's logarithm, is anywhere: a plateau.
+_LEAST_PEAK = 1e-2
 
-# Error at given frequencies after a step, and after a shift of each frequency.
+# Error at given frequencies after a step, and after a relative shift of each frequency.
 ErrorAt = Callable[[Array, Array], Complex[Array, "place long short"]]
 
 
@@ -23,7 +25,7 @@ class Expansion(NamedTuple):
     Attributes:
         error: Σ at each frequency.
         slopes: its derivative along each direction of the parameters.
-        drift: its derivative along the frequency.
+        drift: its derivative along the frequency's logarithm.
         gains: squared singular values, largest first.
         vectors: right singular vectors as columns, in the same order.
         top: the largest of all squared gains; everything is relative to it.
@@ -129,7 +131,7 @@ def curvature(
     cross = blocks[:, :count, count] + bent[1][:count].T
     along = blocks[:, count, count] + bent[1][count]
     # A maximum's own second derivative is negative; elsewhere the frequency stays.
-    peaked = stationary & (along < 0.0)
+    peaked = stationary & (along < -_LEAST_PEAK * model.top * weight)
     pull = jnp.where(peaked, -1.0 / jnp.where(peaked, along, -1.0), 0.0)
     total = total + jnp.einsum("f,fd,fe->de", pull, cross, cross)
     return 0.5 * (total + total.T) / model.top

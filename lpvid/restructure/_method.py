@@ -31,7 +31,7 @@ class HinfMatching(eqx.Module):
     log2_powers: tuple[int, ...] = eqx.field(static=True, default=(1, 3, 5, 7))
     descent_steps: int = eqx.field(static=True, default=60)
     passes: int = eqx.field(static=True, default=1)
-    bundle_steps: int = eqx.field(static=True, default=60)
+    bundle_steps: int = eqx.field(static=True, default=150)
     tolerance: float = eqx.field(static=True, default=1e-4)
 
     def __check_init__(self):

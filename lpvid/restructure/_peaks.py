@@ -4,11 +4,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from lpvid._types import Scalar
 from lpvid.analysis import peak_frequencies
-from lpvid.models import AbstractStructure
+from lpvid.models import AbstractStructure, StateSpace
 from lpvid.restructure._local_model import ErrorAt
 from lpvid.restructure._matching import (
     Target,
@@ -24,6 +25,9 @@ _FAR = 1e7
 # Below this share of the black box's own gain an error is rounding.
 _EXACT = 1e-10
 _MOST_PEAKS = 12
+# Frequencies taken from where the gain is flat; a pole's phases that they are looked for at.
+_PLATEAU = 24
+_PHASES = np.pi / 4.0 * np.array([-1.8, -1.4, -1.0, -0.6, -0.2, 0.2, 0.6, 1.0, 1.4, 1.8])
 
 
 class Places(NamedTuple):
@@ -66,13 +70,8 @@ def find_peaks(
         gains, lines = jax.lax.top_k(gains[:, 0], count)
         places = Places(target.omega[lines], lines)
     else:
-        system = error_system(structure, parameters, target)
-        finite = jnp.all(
-            jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(system)])
-        )
-        # NaN in LAPACK is undefined behaviour at best.
-        safe = jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), system)
-        omega, gains = peak_frequencies(safe, min(max(system.nx // 2 + 2, 4), _MOST_PEAKS))
+        safe, finite = _safe_system(structure, parameters, target)
+        omega, gains = peak_frequencies(safe, min(max(safe.nx // 2 + 2, 4), _MOST_PEAKS))
         direct = jnp.linalg.svd(safe.D, compute_uv=False)[:1]
         gains = jnp.where(finite, jnp.concatenate([gains, direct]), jnp.inf)
         omega = jnp.concatenate([omega, _FAR * target.omega[-1:]])
@@ -83,17 +82,47 @@ def find_peaks(
     return Peaks(places, gains, jnp.where(jnp.isfinite(norm), norm, jnp.inf), floor)
 
 
+def _safe_system(
+    structure: AbstractStructure, parameters: Array, target: Target
+) -> tuple[StateSpace, Bool[Array, ""]]:
+    """The error, zero where it is not finite: NaN in LAPACK is undefined behaviour at best."""
+    system = error_system(structure, parameters, target)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(system)]))
+    return jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), system), finite
+
+
 def error_at(
     structure: AbstractStructure, parameters: Array, shape: Array, target: Target, places: Places
 ) -> ErrorAt:
-    """Σ at the places after a step along the columns of `shape` and a shift of each frequency."""
+    """Σ at the places after a step along `shape`'s columns and relative shifts of frequencies."""
 
     def at(step, shift):
         moved = parameters + shape @ step
         on_grid = target.black_box is None
-        there = target.lines(places.line) if on_grid else target.on(places.omega + shift)
+        there = target.lines(places.line) if on_grid else target.on(places.omega * (1.0 + shift))
         error = response_error(structure, moved, there)
         wide = error.shape[2] > error.shape[1]
         return jnp.swapaxes(error, 1, 2) if wide else error
 
     return at
+
+
+def plateau(
+    structure: AbstractStructure, parameters: Array, target: Target, peaks: Peaks, tolerance: float
+) -> Places:
+    """Active frequencies besides the peaks, spread out: an all-pass error is active everywhere.
+
+    The highest peak again where there are none.
+    """
+    poles = _safe_system(structure, parameters, target)[0].poles()
+    near = jnp.imag(poles)[:, None] + jnp.real(poles)[:, None] * jnp.tan(_PHASES)[None]
+    omega = jnp.sort(jnp.concatenate([target.omega, jnp.abs(near).reshape(-1)]))
+    error = response_error(structure, parameters, target.on(omega))
+    gains = jnp.linalg.svd(error, compute_uv=False)[:, 0]
+    active = gains >= (1.0 - tolerance) * peaks.norm
+    order = jnp.argsort(~active, stable=True)
+    count = jnp.sum(active)
+    chosen = jnp.linspace(0.0, 1.0, _PLATEAU) * jnp.maximum(count - 1, 0).astype(float)
+    omega = omega[order[jnp.round(chosen).astype(int)]]
+    omega = jnp.where(count > 0, omega, peaks.places.omega[0])
+    return Places(omega, jnp.zeros(omega.shape, int))

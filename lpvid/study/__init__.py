@@ -8,3 +8,5 @@ from lpvid.study._study import MODEL_NAMES as MODEL_NAMES
 from lpvid.study._study import StudyResult as StudyResult
 from lpvid.study._study import run_study as run_study
 from lpvid.study._study import summary as summary
+from lpvid.study._undeclared import Undeclared as Undeclared
+from lpvid.study._undeclared import undeclared_record as undeclared_record

@@ -1,4 +1,4 @@
-"""Reports: one self-contained HTML page, and tables as text."""
+"""One self-contained HTML page put together piece by piece, and tables as text."""
 
 import base64
 import dataclasses
@@ -272,5 +272,6 @@ figure { margin: 1rem 0; }
 img { display: block; max-width: 100%; height: auto; background: #ffffff;
   border: 1px solid var(--line); border-radius: 6px; }
 figcaption { color: var(--soft); font-size: .9rem; margin-top: .3rem; }
+@media (max-width: 30rem) { th, td { padding: .3rem .45rem; } }
 @media print { main { max-width: none; } figure, tr { break-inside: avoid; } }
 """

@@ -1,0 +1,226 @@
+"""Blind suite of `close_the_loop`: records with sealed effects, solved and scored.
+
+    python -m benchmarks.blind_suite --seed 2 --records 900 --processes 2 --oracle
+    python -m benchmarks.blind_suite --seed 1 --records 80 --plant flexible-joint
+
+Records and answers are kept in `--folder` and a run that was stopped goes on where it was. Labels
+lie in a file apart, `labels.json`, which only the scorer reads (and the oracle, who is told).
+Development looks at seed 1, the reported figures come from seed 2. `--only KEY` solves one record;
+`--score` only prints.
+"""
+
+import os
+
+# One BLAS thread each, before anything loads a BLAS.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import json
+import multiprocessing
+import tempfile
+import time
+import traceback
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.blind_suite._generate import Record, generate, load, save
+from benchmarks.blind_suite._plants import PLANTS
+from benchmarks.blind_suite._score import (
+    MAIN,
+    breakdown_rows,
+    effect_rows,
+    metrics,
+    pair_rows,
+    score_rows,
+)
+from lpvid.report import text_table
+
+DENIED = {"status": "", "verdict": "failed", "effects": [], "held_out": [], "seconds": np.nan}
+
+
+def solve(record: Record, structure: str | None, told: list[str] | None = None) -> dict:
+    """One record through `close_the_loop`, as plain numbers; a failure becomes its status.
+
+    Args:
+        record: what the solver may see.
+        structure: name of the model structure, the record's own by default.
+        told: names of the effects, for the oracle.
+    """
+    start = time.perf_counter()
+    try:
+        from lpvid.data import IOData
+        from lpvid.loop import close_the_loop
+
+        data = IOData(
+            u=record.u,
+            y=record.y,
+            dt=record.dt,
+            kappa=record.kappa,
+            names={"u": record.input_names, "y": record.output_names},
+            units={"u": record.input_units, "y": record.output_units},
+        )
+        options = {} if told is None else {"laws": _laws(told)}
+        loop = close_the_loop(_structure(structure or record.structure, data), data, **options)
+    except Exception as error:
+        status = "".join(traceback.format_exception_only(error)).strip()
+        where = traceback.format_exc(limit=-3)
+        seconds = time.perf_counter() - start
+        return {"key": record.key, **DENIED, "status": status, "trace": where, "seconds": seconds}
+    return {
+        "key": record.key,
+        "status": "ok",
+        "verdict": loop.verdict,
+        "effects": [
+            {
+                "name": effect.name,
+                "family": effect.family,
+                "port": effect.port,
+                "parameters": [number._asdict() for number in effect.parameters],
+                "confusable_with": list(effect.confusable_with),
+                "gain": float(effect.gain),
+                "held_out_gain": float(effect.held_out_gain),
+                "p_value": float(effect.p_value),
+            }
+            for effect in loop.effects
+        ],
+        "held_out": np.asarray(loop.after.horizon).tolist(),
+        "before": np.asarray(loop.before.horizon).tolist(),
+        "free_run": np.asarray(loop.after.free_run).tolist(),
+        "noise_floor": np.asarray(loop.noise_floor).tolist(),
+        "p_value": float(loop.p_value),
+        "p_value_left": float(loop.p_value_left),
+        "first_round": [
+            [c.name, c.port, float(c.gain)] for c in (loop.rounds[0] if loop.rounds else ())[:5]
+        ],
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def _structure(name: str, data):
+    from lpvid.loop import structures
+
+    found = [kind for kind in vars(structures).values() if getattr(kind, "name", None) == name]
+    if not found:
+        raise ValueError(f"structure={name!r}: lpvid.loop.structures has none of this name.")
+    return found[0](data)
+
+
+def _laws(names: list[str]) -> tuple:
+    """The laws of these names alone."""
+    from lpvid.effects import LIBRARY
+
+    return tuple(law for law in LIBRARY if law.name in names)
+
+
+def _job(job) -> dict:
+    return solve(*job)
+
+
+def _answers(path: Path) -> dict[str, dict]:
+    if not path.exists():
+        return {}
+    lines = [json.loads(line) for line in path.read_text().splitlines() if line]
+    return {line["key"]: line for line in lines}
+
+
+def run(jobs: list, path: Path, processes: int) -> None:
+    """Solve what has no answer yet and append the answers, one line each."""
+    done = _answers(path)
+    jobs = [job for job in jobs if job[0].key not in done]
+    if not jobs:
+        return
+    # Spawned: a process that has started JAX must not be forked.
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(processes) as pool, path.open("a") as file:
+        for answer in tqdm(pool.imap_unordered(_job, jobs), total=len(jobs), unit="record"):
+            file.write(json.dumps(answer) + "\n")
+            file.flush()
+
+
+def _made(arguments) -> tuple[Path, list[Record]]:
+    plants = tuple(arguments.plant or PLANTS)
+    folder = arguments.folder
+    if folder is None:
+        names = "-".join(arguments.plant or ["all"])
+        name = f"lpvid_blind_{arguments.seed}_{arguments.records}_{names}"
+        folder = Path(tempfile.gettempdir()) / name
+    if not (folder / "records.npz").exists():
+        print(f"Simulating {arguments.records} records into {folder}")
+        records, labels = generate(
+            arguments.seed, arguments.records, plants=plants, processes=arguments.processes
+        )
+        save(folder, records, labels)
+    return folder, load(folder)
+
+
+def show(results: dict, labels: dict, oracle: dict | None) -> None:
+    """Print the tables."""
+    figures = metrics(results, labels, oracle)
+    print(f"\n{len(results)} records")
+    print(text_table(score_rows(figures), ["metric", "figure", "goal", "met", "of"]))
+    print("\nBy plant, noise and loop")
+    print(text_table(breakdown_rows(results, labels), ["", "records", *MAIN]))
+    print("\nBy effect")
+    print(text_table(effect_rows(results, labels), ["truth", "records", "right %", "answers else"]))
+    pairs = pair_rows(results, labels)
+    if pairs:
+        print("\nPairs not named exactly")
+        print(text_table(pairs, ["record", "truth", "answer"]))
+    failed = {key: r["status"] for key, r in results.items() if r["status"] != "ok"}
+    for key, status in list(failed.items())[:10]:
+        print(f"{key} failed: {status}")
+
+
+def main() -> None:
+    """Simulate, solve, score."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.blind_suite",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--seed", type=int, default=2)
+    parser.add_argument("--records", type=int, default=900)
+    parser.add_argument("--structure", help="for all records; each plant's own by default")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--plant", action="append", choices=list(PLANTS))
+    parser.add_argument("--folder", type=Path, help="for records and answers")
+    parser.add_argument("--oracle", action="store_true", help="also solve told the effects")
+    parser.add_argument("--first", type=int, help="solve only this many")
+    parser.add_argument("--only", action="append", metavar="KEY", help="solve this record")
+    parser.add_argument("--fresh", action="store_true", help="forget earlier answers")
+    parser.add_argument("--score", action="store_true", help="print earlier answers' figures")
+    arguments = parser.parse_args()
+
+    folder, records = _made(arguments)
+    suffix = f"-{arguments.structure}" if arguments.structure else ""
+    paths = [folder / f"{kind}{suffix}.jsonl" for kind in ("answers", "oracle")]
+    if arguments.fresh:
+        for path in paths:
+            path.unlink(missing_ok=True)
+    chosen = records[: arguments.first]
+    if arguments.only:
+        chosen = [record for record in records if record.key in arguments.only]
+    if not arguments.score:
+        run([(record, arguments.structure) for record in chosen], paths[0], arguments.processes)
+    labels = json.loads((folder / "labels.json").read_text())
+    if arguments.oracle and not arguments.score:
+        names = {key: [e["name"] for e in labels[key]["effects"]] for key in labels}
+        jobs = [
+            (record, arguments.structure, names[record.key])
+            for record in chosen
+            if labels[record.key]["case"] in ("one", "two")
+        ]
+        run(jobs, paths[1], arguments.processes)
+    keys = {record.key for record in chosen}
+    results, oracle = (
+        {key: answer for key, answer in _answers(path).items() if key in keys} for path in paths
+    )
+    if results:
+        show(results, labels, oracle)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,69 @@
+"""Disturbances that follow the clock."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from lpvid.effects._law import AbstractStaticLaw, Amplitude, Scales, Shape, Signals
+
+_MOST = 32
+
+
+class PeriodicDisturbance(AbstractStaticLaw):
+    """A sinusoid in time, A sin ωt + B cos ωt: a rotor out of balance, the mains.
+
+    Nothing is heard of it half a spectral line of the record away: `lines` gives all of them, on
+    which the regressor's likelihood can be had at once; `grid` thins them out.
+
+    Seen as: one spectral line that the input does not excite. Confused with torque ripple (follows
+    the angle) and a missing mode (follows the input).
+
+    Source: Brown and Zhang, Automatica 40 (2004) 1299–1305, periodic disturbances in control.
+
+    Example:
+        >>> law = PeriodicDisturbance()
+        >>> law.regressors(at(time=0.25), jnp.array([2.0 * np.pi]), jnp.zeros(2)).round(9)
+        Array([1., 0.], dtype=float64)
+    """
+
+    name: ClassVar[str] = "periodic-disturbance"
+    family: ClassVar[str] = "disturbance"
+    ports: ClassVar[tuple[str, ...]] = ("input", "force")
+    amplitudes: ClassVar[tuple[Amplitude, ...]] = (
+        Amplitude("A", "{acts_on}"),
+        Amplitude("B", "{acts_on}"),
+    )
+    shapes: ClassVar[tuple[Shape, ...]] = (Shape("omega", "rad/s"),)
+    whole: ClassVar[bool] = False
+
+    def regressors(
+        self, signals: Signals, shape: Float[Array, " shape"], memory: Float[Array, " memory"]
+    ) -> Float[Array, " amplitude"]:
+        """sin ωt, cos ωt."""
+        del memory
+        phase = shape[0] * signals.time
+        return jnp.stack([jnp.sin(phase), jnp.cos(phase)])
+
+    def lines(self, scales: Scales) -> np.ndarray:
+        """Frequencies of whole periods in the record, two at least, up to 0.9 of Nyquist's, rad/s.
+
+        Args:
+            scales: sizes of the signals at the port.
+        """
+        count = int(0.45 * scales.duration / scales.dt)
+        return 2.0 * np.pi / scales.duration * np.arange(2, max(count, 3) + 1)
+
+    def grid(self, scales: Scales) -> np.ndarray:
+        """At most 32 of the record's lines, in geometric progression."""
+        lines = self.lines(scales)
+        chosen = np.geomspace(1.0, lines.size, min(_MOST, lines.size)).round().astype(int) - 1
+        return lines[np.unique(chosen)][:, None]
+
+    def bounds(self, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
+        """From one period in the record to 0.95 of Nyquist's frequency."""
+        return (
+            np.array([2.0 * np.pi / scales.duration]),
+            np.array([max(0.95 * np.pi / scales.dt, 8.0 * np.pi / scales.duration)]),
+        )

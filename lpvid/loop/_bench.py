@@ -1,0 +1,27 @@
+"""What one call of `close_the_loop` works with."""
+
+import dataclasses
+
+from lpvid.data import IOData
+from lpvid.loop._program import Records, Setting
+
+
+@dataclasses.dataclass(frozen=True)
+class Bench:
+    """Everything one call works with.
+
+    Attributes:
+        setting: structure, laws, sample time.
+        data: estimation records and held-out records.
+        train: estimation records for the predictor.
+        held_out: data that took no part.
+        schedules: names of what a parameter may follow.
+        first_sample: of the held-out data in the record they come from.
+    """
+
+    setting: Setting
+    data: tuple[IOData, IOData]
+    train: Records
+    held_out: Records
+    schedules: tuple[str, ...]
+    first_sample: int

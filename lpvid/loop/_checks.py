@@ -1,0 +1,82 @@
+"""What is refused before any work: records and choices that cannot give an answer."""
+
+import numpy as np
+
+from lpvid.data import DataError, IOData
+from lpvid.loop._ported import AbstractPortedStructure
+from lpvid.loop._program import SLOTS
+
+_LEAST_SAMPLES = 100
+_LEAST_HELD_OUT = 50
+
+
+def checked(
+    structure: AbstractPortedStructure,
+    data: IOData,
+    test: IOData | None,
+    split: float,
+    most_effects: int,
+) -> None:
+    """Refuse what cannot give an answer, with the reason and the remedy.
+
+    Args:
+        structure: the base model.
+        data: records.
+        test: other records, if any.
+        split: share that estimates.
+        most_effects: effects to add at most.
+
+    Raises:
+        DataError: non-finite, constant or too short signals, or ones that do not fit.
+        ValueError: an unusable split or number of effects.
+    """
+    if not 1 <= most_effects <= SLOTS:
+        raise ValueError(f"most_effects={most_effects} must be 1 to {SLOTS}.")
+    if test is None and not 0.2 <= split <= 0.9:
+        raise ValueError(
+            f"split={split} must lie between 0.2 and 0.9: it is the share of each record that "
+            "estimates, the rest decides."
+        )
+    for name, one in (("data", data), ("test", test)):
+        if one is not None:
+            _check_channels(name, one, structure)
+    if test is not None and not np.isclose(test.dt, data.dt, rtol=1e-9):
+        raise DataError(
+            f"test has a sample time of {test.dt} s and data one of {data.dt} s: resample one."
+        )
+    if test is not None and (test.kappa is None) != (data.kappa is None):
+        raise DataError("Either both of data and test need a scheduling signal or neither.")
+    if test is not None and len(test.lengths) != len(data.lengths):
+        raise DataError(
+            f"test has {len(test.lengths)} records and data {len(data.lengths)}: give as many."
+        )
+    shortest = min(data.lengths)
+    estimate = shortest if test is not None else int(shortest * split)
+    decide = min(test.lengths) if test is not None else shortest - estimate
+    if estimate < _LEAST_SAMPLES or decide < _LEAST_HELD_OUT:
+        raise DataError(
+            f"Records of {estimate} samples to estimate and {decide} to decide are too short: "
+            f"give at least {_LEAST_SAMPLES} and {_LEAST_HELD_OUT}."
+        )
+
+
+def _check_channels(name: str, data: IOData, structure: AbstractPortedStructure) -> None:
+    wanted = (len(structure.input_names), len(structure.output_names))
+    if (data.nu, data.ny) != wanted:
+        raise DataError(
+            f"{name} has {data.nu} inputs and {data.ny} outputs; the structure "
+            f"'{structure.name}' has {wanted[0]} and {wanted[1]}."
+        )
+    for kind, signals, names in (
+        ("input", np.asarray(data.u), data.input_names),
+        ("output", np.asarray(data.y), data.output_names),
+    ):
+        if not np.all(np.isfinite(signals)):
+            raise DataError(f"{name}: an {kind} has non-finite samples; cut or repair them.")
+        still = np.ptp(signals, axis=0) <= 1e-12 * np.max(np.abs(signals), axis=0)
+        if np.any(still):
+            channel = names[int(np.argmax(still))]
+            raise DataError(
+                f"{name}: {kind} '{channel}' is constant, so it tells nothing. Leave it out with "
+                "data.select, or excite it."
+            )

@@ -1,0 +1,158 @@
+"""Close the loop: fit, test, add, refit, confirm on other data, and say what came of it."""
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from tqdm import tqdm
+
+from lpvid.data import IOData
+from lpvid.effects import LIBRARY, AbstractLaw
+from lpvid.loop._assess import noise_in
+from lpvid.loop._bench import Bench
+from lpvid.loop._checks import checked
+from lpvid.loop._compare import better
+from lpvid.loop._ported import AbstractPortedStructure
+from lpvid.loop._program import SLOTS, Setting
+from lpvid.loop._records import records_of, schedule_names, scheduling_nodes
+from lpvid.loop._result import Loop
+from lpvid.loop._rounds import (
+    Chosen,
+    Ranking,
+    choose,
+    held_out_errors,
+    likelihood_on,
+    rank,
+    without,
+)
+from lpvid.loop._summary import summarise
+from lpvid.loop._tune import Fitted, empty_unknowns, fit, rough_noise
+from lpvid.loop._verdict import LEVEL
+
+
+def close_the_loop(
+    structure: AbstractPortedStructure,
+    data: IOData,
+    *,
+    test: IOData | None = None,
+    split: float = 2.0 / 3.0,
+    laws: Sequence[AbstractLaw] = LIBRARY,
+    most_effects: int = SLOTS,
+    horizon: int | None = None,
+    progress: bool = False,
+) -> Loop:
+    """Find what a model lacks in measured records, add it, and report the error before and after.
+
+    The structure's parameters are started and fitted from the records; the predictor's residual is
+    tested against every law of the library at every port; the best few are refitted, their shapes
+    free, and only what predicts held-out data better is added; at most three effects, each
+    questioned again once another is in.
+
+    Args:
+        structure: the base model with its ports.
+        data: one or several records, each with both estimation and held-out data in it unless
+            `test` is given.
+        test: other records for the held-out errors and decisions; all of `data` then estimates.
+        split: share of each record that estimates.
+        laws: the library of effects.
+        most_effects: effects to add at most.
+        horizon: samples of the horizon error; a twentieth of the held-out record if `None`.
+        progress: whether a bar shows the rounds.
+
+    Returns:
+        A `Loop`: verdict, effects, errors, and what the pictures need.
+
+    Raises:
+        ValueError: unusable records, too short ones, a split that leaves nothing, channels that
+            do not suit the structure.
+
+    Source: the score test is that of C. R. Rao (1948), with the noise model profiled.
+    """
+    begun = time.perf_counter()
+    checked(structure, data, test, split, most_effects)
+    bench = _bench(structure, data, test, split, tuple(laws))
+    with tqdm(total=most_effects + 3, disable=not progress, desc="fitting") as bar:
+        base = _base(bench)
+        bar.update()
+        fitted, chosen, rankings = _rounds(bench, base, most_effects, bar)
+        bar.set_description("assessing")
+        loop = summarise(bench, base, fitted, chosen, rankings, horizon)
+        bar.update()
+    return loop._replace(seconds=time.perf_counter() - begun)
+
+
+def _bench(structure, data, test, split, laws) -> Bench:
+    if test is None:
+        train, held_out = data.split(split)
+        first = int(data.lengths[0] * split)
+    else:
+        train, held_out, first = data, test, 0
+    setting = Setting(structure, laws, train.dt)
+    nodes = scheduling_nodes(data)
+    duration = train.dt * (max(data.lengths) if test is None else max(train.lengths))
+    length = max(train.n_samples, held_out.n_samples)
+    start_time = first * train.dt
+    return Bench(
+        setting=setting,
+        data=(train, held_out),
+        train=records_of(train, nodes, duration, 0.0, length),
+        held_out=records_of(held_out, nodes, duration, start_time, length),
+        schedules=schedule_names(data),
+        first_sample=first,
+    )
+
+
+def _base(bench: Bench) -> Fitted:
+    """The model without effects, fitted; its noise from the top of the residual's spectrum."""
+    structure = bench.setting.structure
+    train = bench.data[0]
+    theta = np.asarray(structure.start(train), float)
+    ports = structure.ports(theta, bench.train.kappa_nodes[0])
+    unknowns = empty_unknowns(
+        theta, ports.A.shape[0], len(train.lengths), ports.force.shape[2]
+    )
+    noise = rough_noise(np.asarray(train.y))
+    fitted = fit(bench.setting, bench.train, (), (), unknowns, noise)
+    noise = np.maximum(noise_in(fitted.searched.errors), 1e-3 * noise)
+    return fit(
+        bench.setting, bench.train, (), (), fitted.unknowns, noise, ratio=fitted.ratio
+    )
+
+
+def _rounds(
+    bench: Bench, base: Fitted, most: int, bar: tqdm
+) -> tuple[Fitted, list[Chosen], list[Ranking]]:
+    fitted, chosen, rankings = base, [], []
+    for _ in range(most):
+        bar.set_description(f"round {len(rankings) + 1}")
+        ranking = rank(fitted, bench.train, bench.schedules)
+        rankings.append(ranking)
+        if ranking.p_value > LEVEL:
+            return fitted, chosen, rankings
+        found = choose(fitted, ranking, bench.train, bench.held_out)
+        bar.update()
+        if found is None:
+            return fitted, chosen, rankings
+        fitted = found.fitted
+        chosen.append(found)
+        if len(chosen) > 1:
+            fitted, chosen = _questioned(bench, fitted, chosen)
+    rankings.append(rank(fitted, bench.train, bench.schedules))
+    return fitted, chosen, rankings
+
+
+def _questioned(
+    bench: Bench, fitted: Fitted, chosen: list[Chosen]
+) -> tuple[Fitted, list[Chosen]]:
+    """Take out earlier effects that held-out data no longer ask for."""
+    slot = 0
+    while slot < len(chosen) - 1:
+        full = likelihood_on(fitted, held_out_errors(fitted, bench.held_out))
+        reduced = without(fitted, bench.train, slot)
+        rival = likelihood_on(reduced, held_out_errors(reduced, bench.held_out))
+        if better(rival, full)[1] < LEVEL:
+            slot += 1
+            continue
+        fitted = reduced
+        chosen = chosen[:slot] + chosen[slot + 1 :]
+    return fitted, chosen

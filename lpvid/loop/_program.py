@@ -1,0 +1,403 @@
+"""The predictor with its effects, one compiled program for every set of effects."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from lpvid.effects import HISTORY, MEMORY, AbstractLaw, Signals
+from lpvid.loop._discretise import Sampled, sampled_at
+from lpvid.loop._ported import AbstractPortedStructure
+
+SLOTS = 3
+"""Effects that a model can hold at once."""
+
+AMPLITUDES = 2
+SHAPES = 2
+
+SUBSTEPS = 4
+"""Steps that a sample is taken in: a law that holds a body still needs them shorter."""
+
+
+def path_rule(spots: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where on its way over a step a law is read, for a sharp one may switch in between.
+
+    Args:
+        spots: how many, odd.
+
+    Returns:
+        Fractions of the step, Simpson's weights for the mean, weights for a straight line's slope.
+    """
+    fractions = np.linspace(0.0, 1.0, spots)
+    weights = np.where(np.arange(spots) % 2 == 1, 4.0, 2.0)
+    weights[[0, -1]] = 1.0
+    weights = weights / np.sum(weights)
+    slopes = weights * (fractions - 0.5)
+    return fractions, weights, slopes / np.sum(slopes * (fractions - 0.5))
+
+
+FRACTIONS = path_rule(3)[0]
+
+
+class Setting(eqx.Module):
+    """What does not change within a search: the structure, the laws and the sample time.
+
+    Attributes:
+        structure: the model.
+        laws: the library.
+        dt: sample time, s.
+        varying: whether an effect of the program may let a parameter vary.
+    """
+
+    structure: AbstractPortedStructure
+    laws: tuple[AbstractLaw, ...] = eqx.field(static=True)
+    dt: float = eqx.field(static=True)
+    varying: bool = eqx.field(static=True, default=False)
+
+
+class Records(eqx.Module):
+    """Records laid one after another, with what every sample needs.
+
+    Attributes:
+        u: (time, nu).
+        y: (time, ny).
+        history: of the inputs, the present sample first (time, lag, nu).
+        time: s since the record's start (time,).
+        kappa_nodes: scheduling nodes (node, nk).
+        weights: of the nodes (time, node).
+        schedules: what a varying parameter may follow, each within ±1 (time, schedule).
+        record: index of the sample's record (time,).
+        first: whether the sample starts its record (time,).
+        counts: 1 where the sample enters a criterion, 0 where it is padding (time,).
+        memory: internal states of the effects at each record's start (record, slot, memory).
+    """
+
+    u: Float[Array, "time nu"]
+    y: Float[Array, "time ny"]
+    history: Float[Array, "time lag nu"]
+    time: Float[Array, " time"]
+    kappa_nodes: Float[Array, "node nk"]
+    weights: Float[Array, "time node"]
+    schedules: Float[Array, "time schedule"]
+    record: Int[Array, " time"]
+    first: Float[Array, " time"]
+    counts: Float[Array, " time"]
+    memory: Float[Array, "record slot memory"]
+
+
+class Slots(eqx.Module):
+    """Which effect sits where; arrays, so that another set of effects needs no new compilation.
+
+    Attributes:
+        used: how many of the slots are.
+        law: index of the law (slot,).
+        input: 1 at the input it acts on (slot, nu).
+        force: 1 at the coordinate it acts on (slot, coordinate).
+        output: 1 at the output it acts on (slot, ny).
+        parameter: 1 at the parameter it lets vary (slot, parameter).
+        schedule: 1 at the schedule that the parameter follows (slot, schedule).
+    """
+
+    used: Int[Array, ""]
+    law: Int[Array, " slot"]
+    input: Float[Array, "slot nu"]
+    force: Float[Array, "slot coordinate"]
+    output: Float[Array, "slot ny"]
+    parameter: Float[Array, "slot parameter"]
+    schedule: Float[Array, "slot schedule"]
+
+
+class Unknowns(eqx.Module):
+    """What is estimated.
+
+    Attributes:
+        theta: parameters of the model (parameter,).
+        amplitude: a (slot, amplitude, direction).
+        shape: s (slot, shape).
+        start: initial state of each record (record, state).
+    """
+
+    theta: Float[Array, " parameter"]
+    amplitude: Float[Array, "slot amplitude direction"]
+    shape: Float[Array, "slot shape"]
+    start: Float[Array, "record state"]
+
+
+class Injection(eqx.Module):
+    """Signals added to the state and to the output, for sensitivities to effects not yet in.
+
+    Attributes:
+        state: added to the next state (time, state).
+        output: added to the predicted output (time, ny).
+    """
+
+    state: Float[Array, "time state"]
+    output: Float[Array, "time ny"]
+
+
+class Trace(eqx.Module):
+    """What the predictor went through.
+
+    Attributes:
+        innovations: y − ŷ (time, ny).
+        before: state before the sample was seen (time, state).
+        state: state with the sample seen (time, state).
+        end: where the state goes from `before` by itself (time, state): the way laws are read on.
+        forces: what the effects added, inputs, then coordinates' directions (time, drive).
+        memory: internal states of the effects before the sample (time, slot, memory).
+    """
+
+    innovations: Float[Array, "time ny"]
+    before: Float[Array, "time state"]
+    state: Float[Array, "time state"]
+    end: Float[Array, "time state"]
+    forces: Float[Array, "time drive"]
+    memory: Float[Array, "time slot memory"]
+
+
+def laws_of(laws: Sequence[AbstractLaw]):
+    """One function for all laws, along the path that the signals take over a step.
+
+    It takes a law's index, its signals at several fractions of the step (fraction,), those in the
+    step's middle, the fractions times the step in s, the shape, the memory, and the step in s; it
+    gives the regressors (fraction, amplitude) and the memory at the step's end.
+
+    Args:
+        laws: the library.
+    """
+
+    def one(law: AbstractLaw):
+        own, spare = len(law.shapes), AMPLITUDES - len(law.amplitudes)
+
+        def evaluate(path: Signals, middle: Signals, after: Array, shape: Array, memory: Array, dt):
+            shape = shape[:own]
+
+            def at(signals, passed):
+                now = law.advance(middle, shape, memory, passed) if law.memory else memory
+                return law.regressors(signals, shape, now)
+
+            values = jax.vmap(at)(path, after)
+            end = law.advance(middle, shape, memory, dt) if law.memory else memory
+            return jnp.concatenate([values, jnp.zeros((values.shape[0], spare))], axis=1), end
+
+        return evaluate
+
+    branches = [one(law) for law in laws]
+    return lambda index, *of: lax.switch(index, branches, *of)
+
+
+def moments(values: Float[Array, "fraction *rest"]) -> tuple[Array, Array]:
+    """Start and change over a step of the straight line that fits values along it.
+
+    Args:
+        values: at the fractions of `path_rule`.
+    """
+    _, weights, slopes = path_rule(values.shape[0])
+    mean = jnp.tensordot(jnp.asarray(weights), values, axes=1)
+    change = jnp.tensordot(jnp.asarray(slopes), values, axes=1)
+    return mean - 0.5 * change, change
+
+
+def node_matrices(
+    setting: Setting, slots: Slots, unknowns: Unknowns, records: Records, step: float
+) -> tuple[Sampled, Float[Array, "time all_nodes"]]:
+    """Matrices at the nodes of κ and, where parameters vary, of their schedules; with weights.
+
+    A parameter that follows a schedule φ within ±1 is worked out at φ = −1, 0 and 1 and
+    interpolated by the parabola through them, its error of third order in the amplitude.
+
+    Args:
+        setting: structure, laws, sample time.
+        slots: which effects.
+        unknowns: parameters and amplitudes.
+        records: the nodes and their weights.
+        step: that the matrices are for, s.
+    """
+    nodes = records.kappa_nodes.shape[0]
+    thetas = unknowns.theta[None]
+    factors = jnp.ones((records.u.shape[0], 1))
+    if setting.varying:
+        amounts = unknowns.amplitude[:, :1, 0] * slots.parameter
+        follow = records.schedules @ slots.schedule.T
+        thetas = jnp.concatenate(
+            [thetas, unknowns.theta * (1.0 + amounts), unknowns.theta * (1.0 - amounts)]
+        )
+        up, down = 0.5 * (follow**2 + follow), 0.5 * (follow**2 - follow)
+        middle = 1.0 - jnp.sum(follow**2, axis=1, keepdims=True)
+        factors = jnp.concatenate([middle, up, down], axis=1)
+    every = jnp.repeat(thetas, nodes, axis=0)
+    kappas = jnp.tile(records.kappa_nodes, (thetas.shape[0], 1))
+    matrices = sampled_at(setting.structure, every, kappas, step)
+    weights = (factors[:, :, None] * records.weights[:, None, :]).reshape(records.u.shape[0], -1)
+    return matrices, weights
+
+
+def _at(matrices: Sampled, weight: Float[Array, " node"]) -> Sampled:
+    if weight.shape[0] == 1:
+        return jax.tree.map(lambda leaf: leaf[0], matrices)
+    return jax.tree.map(lambda leaf: jnp.tensordot(weight, leaf, axes=1), matrices)
+
+
+def trace(
+    setting: Setting,
+    records: Records,
+    slots: Slots,
+    unknowns: Unknowns,
+    gain: Float[Array, "node state ny"],
+    injection: Injection,
+) -> Trace:
+    """Run the predictor over the records.
+
+    Each sample: ŷ = C x + D u with the sensors' effects; `SUBSTEPS` exponential steps from x with
+    the effects along the way, a straight line over each step; and Φ L (y − ŷ) added at the end.
+    With a gain of zero it is a simulation.
+
+    Args:
+        setting: structure, laws, sample time.
+        records: signals, weights, starts.
+        slots: which effects.
+        unknowns: parameters, amplitudes, shapes, initial states.
+        gain: L at the nodes of κ (node, state, ny).
+        injection: added signals, usually zero.
+    """
+    evaluate = laws_of(setting.laws)
+    fine = setting.dt / SUBSTEPS
+    matrices, node_weights = node_matrices(setting, slots, unknowns, records, fine)
+    nu, ny = records.u.shape[1], records.y.shape[1]
+    coordinates, directions = slots.force.shape[1], unknowns.amplitude.shape[2]
+
+    def read(M: Sampled, states, u):
+        """Coordinates' and outputs' signals for states (fraction, state)."""
+        still = jnp.ones((states.shape[0], 1)) * u[None]
+        return (
+            states @ M.position.T,
+            states @ M.velocity.T,
+            states @ M.acceleration_state.T + still @ M.acceleration_input.T,
+            states @ M.load_state.T + still @ M.load_input.T,
+            states @ M.C.T + still @ M.D.T,
+        )
+
+    def contributions(M: Sampled, begin, end, memory, u, history, time):
+        """What the effects add on the way (fraction, drive), to outputs (ny,), their memory."""
+        shares = jnp.asarray(FRACTIONS)[:, None]
+        path = read(M, (1.0 - shares) * begin[None] + shares * end[None], u)
+        middle = read(M, 0.5 * (begin + end)[None], u)
+        after = jnp.asarray(FRACTIONS) * fine
+
+        def at_slot(slot, signals, times):
+            position, velocity, acceleration, load, ideal = signals
+            force, still = slots.force[slot], jnp.ones_like(times)
+            return Signals(
+                position=position @ force,
+                velocity=velocity @ force,
+                acceleration=acceleration @ force,
+                load=load @ force,
+                input=still * (slots.input[slot] @ u),
+                output=ideal @ slots.output[slot],
+                time=times,
+                history=still[:, None] * (history @ slots.input[slot])[None],
+            )
+
+        def one(slot, so_far):
+            drive, output, next_memory = so_far
+            here = at_slot(slot, path, time + after)
+            centre = at_slot(slot, middle, time + jnp.full(1, 0.5 * fine))
+            values, following = evaluate(
+                slots.law[slot],
+                here,
+                jax.tree.map(lambda leaf: leaf[0], centre),
+                after,
+                unknowns.shape[slot],
+                memory[slot],
+                jnp.asarray(fine),
+            )
+            total = values @ unknowns.amplitude[slot]
+            pushed = (slots.force[slot][None, :, None] * total[:, None, :]).reshape(total.shape[0], -1)
+            into = jnp.concatenate([total[:, :1] * slots.input[slot][None], pushed], axis=1)
+            return (
+                drive + into,
+                output + total[0, 0] * slots.output[slot],
+                next_memory.at[slot].set(following),
+            )
+
+        still = jnp.zeros((FRACTIONS.size, nu + coordinates * directions))
+        start = (still, jnp.zeros(ny), memory)
+        return lax.fori_loop(0, slots.used, one, start)
+
+    def step(carry, sample):
+        x, memory, drive = carry
+        u, y, history, time, weight, kappa_weight, first, which, added_x, added_y = sample
+        M = _at(matrices, weight)
+        L = jnp.tensordot(kappa_weight, gain, axes=1)
+        x = jnp.where(first > 0.0, unknowns.start[which], x)
+        memory = jnp.where(first > 0.0, records.memory[which], memory)
+        drive = jnp.where(first > 0.0, 0.0, drive)
+        held = jnp.concatenate([u, jnp.zeros(coordinates * directions)])
+
+        def fraction(state, number):
+            # Laws are read on the way that the model takes by itself, with the last forces; a
+            # correction by the innovation would only be another predictor's gain.
+            x, memory, drive = state
+            free = M.transition @ x
+            end = free + M.drive @ (held + drive)
+            begun = time + fine * number
+            along, sensed, following = contributions(M, x, end, memory, u, history, begun)
+            level, change = moments(along)
+            moved = free + M.drive @ (held + level) + M.ramp @ change
+            return (moved, following, level + change), (sensed, level)
+
+        (moved, following, drive), (sensed, levels) = lax.scan(
+            fraction, (x, memory, drive), jnp.arange(float(SUBSTEPS))
+        )
+        error = y - (M.C @ x + M.D @ (u + levels[0, :nu]) + sensed[0] + added_y)
+        correction = L @ error
+        for _ in range(SUBSTEPS):
+            correction = M.transition @ correction
+        # Added here, so that a sensitivity sees it as one more force over the sample.
+        ahead = moved + correction + added_x
+        out = (error, x, x + L @ error, moved, jnp.mean(levels, axis=0), memory)
+        return (ahead, following, drive), out
+
+    samples = (
+        records.u,
+        records.y,
+        records.history,
+        records.time,
+        node_weights,
+        records.weights,
+        records.first,
+        records.record,
+        injection.state,
+        injection.output,
+    )
+    idle = jnp.zeros(nu + coordinates * directions)
+    start = (unknowns.start[0], jnp.zeros((SLOTS, MEMORY)), idle)
+    _, out = lax.scan(step, start, samples)
+    return Trace(*out)
+
+
+def nothing_injected(records: Records, states: int) -> Injection:
+    """An injection of zeros.
+
+    Args:
+        records: whose length it has.
+        states: of the model.
+    """
+    return Injection(jnp.zeros((records.u.shape[0], states)), jnp.zeros_like(records.y))
+
+
+def history_of(u: Float[Array, "time nu"], first: Float[Array, " time"]) -> Float[Array, "..."]:
+    """The inputs' last samples, the present one first, the first sample held before a start.
+
+    Args:
+        u: (time, nu), several records one after another.
+        first: whether a sample starts its record (time,).
+    """
+    place = jnp.arange(u.shape[0])
+    begin = lax.cummax(jnp.where(first > 0.0, place, 0))
+    lags = jnp.arange(HISTORY)
+    return u[jnp.maximum(place[:, None] - lags[None, :], begin[:, None])]

@@ -1,0 +1,296 @@
+"""One round: score every candidate, refit the best few, keep what held-out data confirm."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+
+from lpvid.loop._candidates import Place, Trial, places_of
+from lpvid.loop._columns import along, force_columns, scales_of, trial_columns
+from lpvid.loop._compare import better, sample_likelihood
+from lpvid.loop._program import SLOTS, Records, Unknowns
+from lpvid.loop._score import Scored, ScoreTest, family_wise
+from lpvid.loop._search import run
+from lpvid.loop._tune import Fitted, fit, with_starts
+from lpvid.loop._verdict import LEVEL
+
+_ALIKE = 0.95
+"""Cosine between projected sensitivities from which two effects are taken for one another."""
+
+_REFITTED = 3
+_REALISED = 0.5
+"""Share of the promised gain below which a refit counts as a failed search, not as evidence."""
+
+
+class Ranked(NamedTuple):
+    """One place with its best shape.
+
+    Attributes:
+        trial: place and shape.
+        scored: gain, amplitudes, p-value.
+        columns: sensitivities (time, ny, column).
+        penalised: gain less the complexity penalty.
+    """
+
+    trial: Trial
+    scored: Scored
+    columns: np.ndarray
+    penalised: float
+
+
+class Ranking(NamedTuple):
+    """All places of a round, best first.
+
+    Attributes:
+        entries: one a place, of those with any gain.
+        test: the score test, for projections.
+        tests: number of tests made.
+        p_value: family-wise, of the best.
+        general: family-wise p-value of the general force terms.
+    """
+
+    entries: tuple[Ranked, ...]
+    test: ScoreTest
+    tests: int
+    p_value: float
+    general: float
+
+
+def rank(fitted: Fitted, records: Records, schedules: Sequence[str]) -> Ranking:
+    """Score every law at every port.
+
+    Args:
+        fitted: the model as it stands.
+        records: estimation data.
+        schedules: names of what a parameter may follow.
+    """
+    setting = fitted.setting
+    trace = along(setting, records, fitted.slots, fitted.unknowns, fitted.gain)
+    taken = set(fitted.places)
+    places = [p for p in places_of(setting.structure, setting.laws, schedules) if p not in taken]
+    tests = 0
+    test = ScoreTest(fitted.searched.errors, fitted.searched.columns)
+    samples = fitted.searched.errors.shape[0]
+    best: dict[Place, Ranked] = {}
+    for trial, columns in trial_columns(trace, places):
+        tests += 1
+        law = setting.laws[trial.place.law]
+        directions = columns.shape[2] // len(law.amplitudes)
+        positive = np.array([a.positive and directions == 1 for a in law.amplitudes])
+        if law.whole:
+            positive = np.ones(len(law.amplitudes), bool)
+        scored = test.score(columns, np.repeat(positive, directions))
+        numbers = columns.shape[2] + len(law.shapes)
+        penalised = scored.gain - 0.5 * numbers * np.log(samples)
+        old = best.get(trial.place)
+        if scored.gain > 0.0 and (old is None or penalised > old.penalised):
+            best[trial.place] = Ranked(trial, scored, columns, penalised)
+    entries = sorted(best.values(), key=lambda entry: -entry.penalised)
+    least = min((entry.scored.p_value for entry in entries), default=1.0)
+    general = _general(trace, test)
+    return Ranking(
+        tuple(entries), test, tests, family_wise(least, max(tests, 1)), general
+    )
+
+
+def _general(trace, test: ScoreTest) -> float:
+    """Family-wise p-value of smooth force terms that belong to no effect of the library.
+
+    Products of Legendre polynomials in position and velocity up to degree three, at each
+    coordinate, tested together.
+    """
+    structure = trace.setting.structure
+    least, tests = 1.0, 0
+    for coordinate in range(len(structure.coordinate_names)):
+        start, end = (trace.signals[name] for name in ("start", "end"))
+        sizes = {}
+        for name in ("position", "velocity"):
+            values = np.asarray(start[name][:, coordinate])
+            sizes[name] = max(float(np.max(np.abs(values))), 1e-300)
+
+        def terms(signals, sizes=sizes, coordinate=coordinate):
+            q = np.clip(np.asarray(signals["position"][:, coordinate]) / sizes["position"], -2, 2)
+            v = np.clip(np.asarray(signals["velocity"][:, coordinate]) / sizes["velocity"], -2, 2)
+            legendre = np.polynomial.legendre.legvander2d(q, v, (3, 3))
+            degrees = np.add.outer(np.arange(4), np.arange(4)).ravel()
+            return legendre[:, (degrees > 1) & (degrees < 4)]
+
+        begin, final = terms(start), terms(end)
+        columns = force_columns(trace, coordinate, begin, final - begin)
+        scored = test.score(columns, np.zeros(columns.shape[2], bool))
+        least, tests = min(least, scored.p_value), tests + 1
+    return family_wise(least, max(tests, 1))
+
+
+def _seated(unknowns: Unknowns, slot: int, entry: Ranked, whole: bool) -> Unknowns:
+    """The unknowns with a candidate in a slot."""
+    amplitude, shape = np.array(unknowns.amplitude), np.array(unknowns.shape)
+    amplitude[slot], shape[slot] = 0.0, 0.0
+    if whole:
+        amplitude[slot, 0, 0] = 1.0
+    else:
+        directions = amplitude.shape[2] if entry.trial.place.port == "force" else 1
+        values = entry.scored.amplitude.reshape(-1, directions)
+        amplitude[slot, : values.shape[0], :directions] = values
+    shape[slot, : entry.trial.shape.size] = entry.trial.shape
+    return eqx.tree_at(lambda tree: (tree.amplitude, tree.shape), unknowns, (jnp.asarray(amplitude), jnp.asarray(shape)))
+
+
+def held_out_errors(fitted: Fitted, records: Records) -> np.ndarray:
+    """One-step errors on other records, initial states fitted (time, ny).
+
+    Args:
+        fitted: the model.
+        records: held-out data.
+    """
+    unknowns = with_starts(fitted, records)
+    out = run(fitted.setting, records, fitted.slots, unknowns, fitted.gain)
+    count = int(np.sum(np.asarray(records.counts)))
+    return np.asarray(out.innovations)[:count]
+
+
+def likelihood_on(fitted: Fitted, errors: np.ndarray) -> np.ndarray:
+    own = fitted.searched.errors
+    return sample_likelihood(errors, own.T @ own / own.shape[0])
+
+
+class Chosen(NamedTuple):
+    """What a round added.
+
+    Attributes:
+        fitted: the model with the effect in.
+        entry: the candidate.
+        confusable: places that the records cannot tell from it.
+        held_out_gain: in log-likelihood.
+        p_value: family-wise, of the score test.
+    """
+
+    fitted: Fitted
+    entry: Ranked
+    confusable: tuple[Place, ...]
+    held_out_gain: float
+    p_value: float
+
+
+def with_effect(fitted: Fitted, records: Records, entry: Ranked) -> Fitted:
+    """The model refitted with a candidate in its next slot.
+
+    Args:
+        fitted: the model as it stands.
+        records: estimation data.
+        entry: the candidate.
+    """
+    law = fitted.setting.laws[entry.trial.place.law]
+    trace = along(fitted.setting, records, fitted.slots, fitted.unknowns, fitted.gain)
+    scales = scales_of(trace, entry.trial.place)
+    unknowns = _seated(fitted.unknowns, len(fitted.places), entry, law.whole)
+    return fit(
+        fitted.setting,
+        records,
+        (*fitted.places, entry.trial.place),
+        (*fitted.scales, scales),
+        unknowns,
+        fitted.noise,
+        ratio=fitted.ratio,
+    )
+
+
+def without(fitted: Fitted, records: Records, slot: int) -> Fitted:
+    """The model refitted without one of its effects.
+
+    Args:
+        fitted: the model.
+        records: estimation data.
+        slot: which effect to leave out.
+    """
+    kept = [place for place in range(len(fitted.places)) if place != slot]
+    order = np.asarray([*kept, slot, *range(len(fitted.places), SLOTS)])
+    amplitude = np.array(fitted.unknowns.amplitude)[order]
+    shape = np.array(fitted.unknowns.shape)[order]
+    amplitude[len(kept) :], shape[len(kept) :] = 0.0, 0.0
+    unknowns = eqx.tree_at(
+        lambda tree: (tree.amplitude, tree.shape),
+        fitted.unknowns,
+        (jnp.asarray(amplitude), jnp.asarray(shape)),
+    )
+    return fit(
+        fitted.setting,
+        records,
+        [fitted.places[place] for place in kept],
+        [fitted.scales[place] for place in kept],
+        unknowns,
+        fitted.noise,
+        ratio=fitted.ratio,
+    )
+
+
+def choose(
+    fitted: Fitted, ranking: Ranking, records: Records, held_out: Records
+) -> Chosen | None:
+    """Refit the best few and take the one that held-out data prefer, if they prefer any.
+
+    Args:
+        fitted: the model as it stands.
+        ranking: of this round.
+        records: estimation data.
+        held_out: data that took no part.
+    """
+    significant = [
+        entry
+        for entry in ranking.entries
+        if family_wise(entry.scored.p_value, ranking.tests) < LEVEL
+    ]
+    if not significant:
+        return None
+    before = likelihood_on(fitted, held_out_errors(fitted, held_out))
+    tried: list[tuple[Ranked, Fitted, np.ndarray]] = []
+    for entry in significant[:_REFITTED]:
+        refitted = with_effect(fitted, records, entry)
+        realised = refitted.searched.log_likelihood - fitted.searched.log_likelihood
+        if realised < _REALISED * min(entry.scored.gain, 50.0):
+            continue
+        errors = held_out_errors(refitted, held_out)
+        tried.append((entry, refitted, likelihood_on(refitted, errors)))
+    if not tried:
+        return None
+    tried.sort(key=lambda one: -float(np.sum(one[2])) if np.all(np.isfinite(one[2])) else np.inf)
+    entry, refitted, likelihood = tried[0]
+    gain, p_value = better(before, likelihood)
+    if p_value > LEVEL:
+        return None
+    confusable = [
+        other.trial.place
+        for other, model, rival in tried[1:]
+        if better(rival, likelihood)[1] > LEVEL
+        and model.searched.log_likelihood
+        > refitted.searched.log_likelihood - scipy.stats.chi2.isf(LEVEL, 1) / 2.0
+    ]
+    confusable += _alike(ranking, entry, [one[0] for one in tried])
+    promised = family_wise(entry.scored.p_value, ranking.tests)
+    return Chosen(refitted, entry, tuple(dict.fromkeys(confusable)), gain, promised)
+
+
+def _alike(ranking: Ranking, entry: Ranked, tried: Sequence[Ranked]) -> list[Place]:
+    """Places whose sensitivities point where the winner's do; those refitted have been judged."""
+    own = _plane(ranking.test.projected(entry.columns))
+    judged = {other.trial.place for other in tried}
+    found = []
+    for other in ranking.entries:
+        # What gains far less cannot point the same way.
+        if other.trial.place in judged or other.scored.gain < 0.8 * entry.scored.gain:
+            continue
+        plane = _plane(ranking.test.projected(other.columns))
+        if plane.shape[1] != own.shape[1]:
+            continue
+        cosine = np.linalg.svd(own.T @ plane, compute_uv=False).min()
+        if cosine > _ALIKE:
+            found.append(other.trial.place)
+    return found
+
+
+def _plane(columns: np.ndarray) -> np.ndarray:
+    norms = np.linalg.norm(columns, axis=0)
+    return np.linalg.qr(columns / np.where(norms > 0.0, norms, 1.0))[0]

@@ -1,0 +1,258 @@
+"""From fitted models to the record that the user gets."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from lpvid.analysis import residual_tests
+from lpvid.effects import Units, fill
+from lpvid.loop._assess import (
+    errors_of,
+    ladder,
+    noise_in,
+    robust_covariance,
+    standard_errors,
+)
+from lpvid.loop._bench import Bench
+from lpvid.loop._candidates import Place, port_name
+from lpvid.loop._result import (
+    Candidate,
+    EstimatedNumber,
+    FoundEffect,
+    Ladder,
+    Loop,
+    Series,
+)
+from lpvid.loop._rounds import Chosen, Ranking, held_out_errors, without
+from lpvid.loop._score import family_wise
+from lpvid.loop._tune import Fitted, free_unknowns
+from lpvid.loop._verdict import Evidence, decide, explained
+from lpvid.loop._virtual_force import virtual_forces
+
+_SEPARATING = {
+    "input": "the same input at two or three amplitudes",
+    "force": "slow motion beside fast motion, and small amplitudes beside large ones",
+    "output": "motion over the sensor's whole range at low speed",
+    "parameter": "the same input at several operating points, and again some time later",
+}
+
+
+def summarise(
+    bench: Bench,
+    base: Fitted,
+    fitted: Fitted,
+    chosen: Sequence[Chosen],
+    rankings: Sequence[Ranking],
+    horizon: int | None,
+) -> Loop:
+    """Everything the report shows.
+
+    Args:
+        bench: what the call works with.
+        base: the model without effects.
+        fitted: the model with them.
+        chosen: the effects, in the order of the model's slots.
+        rankings: of every round.
+        horizon: samples, or `None` for a twentieth of the held-out record.
+    """
+    held_out = bench.data[1]
+    count = held_out.n_samples
+    if horizon is None:
+        horizon = int(np.clip(min(held_out.lengths) // 20, 5, 200))
+    errors = {name: held_out_errors(model, bench.held_out) for name, model in _both(base, fitted)}
+    before, ladder_before, run_before = errors_of(
+        base, bench.held_out, errors["before"], horizon
+    )
+    after, ladder_after, run_after = before, ladder_before, run_before
+    if chosen:
+        after, ladder_after, run_after = errors_of(
+            fitted, bench.held_out, errors["after"], horizon
+        )
+    y = np.asarray(held_out.y)
+    floor = np.minimum(noise_in(errors["after"]), noise_in(y - run_after))
+    floor = np.minimum(floor, after.one_step)
+    last = rankings[-1]
+    evidence = Evidence(
+        p_value=rankings[0].p_value,
+        p_value_left=min(1.0, 2.0 * min(last.p_value, last.general)),
+        named=bool(chosen),
+        near=float(np.max(after.one_step / floor)),
+        explained=explained(before.horizon, after.horizon, floor),
+    )
+    verdict, advice = decide(evidence)
+    if verdict == "abstain" and chosen:
+        # What is not named is not kept either: the errors are those of the model as it was.
+        fitted, chosen = base, []
+        after, ladder_after, run_after = before, ladder_before, run_before
+        errors["after"] = errors["before"]
+    covariance = robust_covariance(fitted)
+    ablation = {}
+    for slot, found in enumerate(chosen):
+        name = _label(bench, found.entry.trial.place)
+        ablation[name] = before.horizon
+        if len(chosen) > 1:
+            reduced = without(fitted, bench.train, slot)
+            steps = ladder(reduced, bench.held_out, horizon)
+            ablation[name] = np.sqrt(np.mean(steps**2, axis=0))
+    structure = bench.setting.structure
+    return Loop(
+        verdict=verdict,
+        advice=advice,
+        structure=str(structure.name),
+        parameters=_parameters(bench, fitted, covariance),
+        effects=tuple(
+            _effect(bench, fitted, covariance, slot, found) for slot, found in enumerate(chosen)
+        ),
+        before=before,
+        after=after,
+        noise_floor=floor,
+        noise_floor_from="estimated from the top of the residual's spectrum",
+        held_out=(bench.first_sample, bench.first_sample + count - 1),
+        horizon=horizon,
+        ladder=Ladder(np.arange(1, horizon + 1), ladder_before, ladder_after),
+        p_value=evidence.p_value,
+        p_value_left=evidence.p_value_left,
+        tests_made=int(sum(ranking.tests for ranking in rankings)),
+        rounds=tuple(_ranked(bench, ranking) for ranking in rankings),
+        ablation=ablation,
+        residual_tests=_classical(errors["after"], held_out),
+        virtual_forces=virtual_forces(bench, fitted),
+        series=Series(
+            np.arange(count) * held_out.dt,
+            y,
+            run_before,
+            run_after,
+            errors["before"],
+            errors["after"],
+        ),
+        output_names=held_out.output_names,
+        output_units=held_out.output_units,
+        dt=held_out.dt,
+        seconds=0.0,
+    )
+
+
+def _both(base: Fitted, fitted: Fitted):
+    return (("before", base), ("after", fitted))
+
+
+def _label(bench: Bench, place: Place) -> str:
+    law = bench.setting.laws[place.law]
+    return f"{law.name} at {port_name(bench.setting.structure, place, bench.schedules)}"
+
+
+def _ranked(bench: Bench, ranking: Ranking) -> tuple[Candidate, ...]:
+    structure, laws = bench.setting.structure, bench.setting.laws
+    return tuple(
+        Candidate(
+            name=laws[entry.trial.place.law].name,
+            family=laws[entry.trial.place.law].family,
+            port=port_name(structure, entry.trial.place, bench.schedules),
+            gain=entry.scored.gain,
+            penalised=entry.penalised,
+            p_value=family_wise(entry.scored.p_value, ranking.tests),
+        )
+        for entry in ranking.entries
+    )
+
+
+def _parameters(
+    bench: Bench, fitted: Fitted, covariance: np.ndarray
+) -> tuple[EstimatedNumber, ...]:
+    structure, theta = bench.setting.structure, np.asarray(fitted.unknowns.theta)
+    spread = standard_errors(covariance)[: theta.size]
+    rows = zip(
+        structure.parameter_names, theta, spread, structure.parameter_units, strict=True
+    )
+    return tuple(
+        EstimatedNumber(name, float(value), float(std), unit) for name, value, std, unit in rows
+    )
+
+
+def _units(bench: Bench, place: Place) -> Units:
+    structure = bench.setting.structure
+    if place.port == "force":
+        return Units(
+            structure.force_units[place.index], structure.coordinate_units[place.index]
+        )
+    if place.port == "input":
+        return Units(structure.input_units[place.index])
+    if place.port == "output":
+        return Units(structure.output_units[place.index])
+    return Units("")
+
+
+def _effect(
+    bench: Bench, fitted: Fitted, covariance: np.ndarray, slot: int, found: Chosen
+) -> FoundEffect:
+    place = found.entry.trial.place
+    law, units = bench.setting.laws[place.law], _units(bench, place)
+    where, _, _ = free_unknowns(
+        bench.setting, fitted.places, fitted.scales, fitted.unknowns
+    )
+    spread = np.full(int(where.max()) + 1, np.nan)
+    spread[where] = standard_errors(covariance)
+    directions = fitted.unknowns.amplitude.shape[2]
+    along = directions if place.port == "force" else 1
+    amplitudes, shapes = fitted.unknowns.amplitude[slot], fitted.unknowns.shape[slot]
+    start = fitted.unknowns.theta.size + slot * fitted.unknowns.amplitude[0].size
+    numbers = []
+    if not law.whole:
+        for number, amplitude in enumerate(law.amplitudes):
+            for direction in range(along):
+                suffix = f"[{direction + 1}]" if along > 1 else ""
+                numbers.append(
+                    EstimatedNumber(
+                        amplitude.name + suffix,
+                        float(amplitudes[number, direction]),
+                        float(spread[start + number * directions + direction]),
+                        fill(amplitude.unit, units),
+                    )
+                )
+    start = (
+        fitted.unknowns.theta.size
+        + fitted.unknowns.amplitude.size
+        + slot * fitted.unknowns.shape.shape[1]
+    )
+    for number, shape in enumerate(law.shapes):
+        numbers.append(
+            EstimatedNumber(
+                shape.name,
+                float(shapes[number]),
+                float(spread[start + number]),
+                fill(shape.unit, units),
+            )
+        )
+    confusable = tuple(_label(bench, other) for other in found.confusable)
+    return FoundEffect(
+        name=law.name,
+        family=law.family,
+        port=port_name(bench.setting.structure, place, bench.schedules),
+        parameters=tuple(numbers),
+        confusable_with=confusable,
+        gain=found.entry.scored.gain,
+        held_out_gain=found.held_out_gain,
+        p_value=found.p_value,
+        separating_input=_SEPARATING[place.port] if confusable else "",
+    )
+
+
+def _classical(errors: np.ndarray, data) -> dict[str, float]:
+    """p-values of the classical tests: whiteness, cross-correlation, and of the squares."""
+    found = {}
+    try:
+        linear = residual_tests(jnp.asarray(errors), data.u, lengths=data.lengths)
+        centred = (np.asarray(data.u) - np.mean(np.asarray(data.u), axis=0)) ** 2
+        squares = residual_tests(
+            jnp.asarray(errors**2), jnp.asarray(centred), lengths=data.lengths
+        )
+    except ValueError:
+        # Too short or constant residuals: the tests have nothing to say.
+        return found
+    found["whiteness"] = float(linear.joint_whiteness_p)
+    found["cross-correlation with the input"] = float(np.min(np.asarray(linear.dynamics_p)))
+    found["squared residual against squared input"] = float(
+        np.min(np.asarray(squares.dynamics_p))
+    )
+    return found

@@ -1,0 +1,245 @@
+"""Fitting a model with its effects: innovations by least squares, diffusion by likelihood."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from lpvid.effects import Scales
+from lpvid.loop._candidates import Place, slots_of
+from lpvid.loop._gain import gains
+from lpvid.loop._program import AMPLITUDES, SHAPES, SLOTS, Records, Setting, Slots, Unknowns
+from lpvid.loop._search import Searched, log_likelihood, run, search
+
+RATIOS = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1e4)
+"""Diffusions tried, relative to the outputs' noise; 0 is a simulation."""
+
+_WORTH = 0.5
+"""Least gain in log-likelihood for which diffusion and parameters take another turn."""
+
+_SLOW = 1e-2
+"""The slow gain's share of the diffusion: it shows what a fast one follows and so hides."""
+
+
+class Fitted(NamedTuple):
+    """A model with its effects, fitted.
+
+    Attributes:
+        setting: structure, laws, sample time.
+        places: where each effect sits.
+        scales: sizes of the signals at each effect's port.
+        slots: the same as arrays.
+        unknowns: everything estimated.
+        gain: L at the nodes of κ.
+        ratio: diffusion.
+        noise: standard deviation of the outputs' noise that the gain was made for (ny,).
+        searched: errors, derivatives, likelihood.
+    """
+
+    setting: Setting
+    places: tuple[Place, ...]
+    scales: tuple[Scales, ...]
+    slots: Slots
+    unknowns: Unknowns
+    gain: Array
+    ratio: float
+    noise: np.ndarray
+    searched: Searched
+
+
+_gains = eqx.filter_jit(gains)
+
+
+def rough_noise(y: np.ndarray) -> np.ndarray:
+    """Noise of the outputs (ny,) from their fourth differences, which smooth motion hardly has.
+
+    Args:
+        y: (time, ny).
+    """
+    difference = np.diff(y, n=4, axis=0)
+    # The binomial coefficients' squares sum to 70.
+    spread = np.median(np.abs(difference), axis=0) / 0.6745 / np.sqrt(70.0)
+    return np.maximum(spread, 1e-9 * np.maximum(np.std(y, axis=0), 1e-300))
+
+
+def empty_unknowns(theta: np.ndarray, states: int, records: int, directions: int) -> Unknowns:
+    """Unknowns of a model without effects, at rest.
+
+    Args:
+        theta: parameters (parameter,).
+        states: of the model.
+        records: how many.
+        directions: of a force.
+    """
+    return Unknowns(
+        theta=jnp.asarray(theta, float),
+        amplitude=jnp.zeros((SLOTS, AMPLITUDES, directions)),
+        shape=jnp.zeros((SLOTS, SHAPES)),
+        start=jnp.zeros((records, states)),
+    )
+
+
+def start_places(unknowns: Unknowns) -> np.ndarray:
+    """Places of the initial states in the flattened unknowns.
+
+    Args:
+        unknowns: whose layout it is.
+    """
+    size = unknowns.start.size
+    before = unknowns.theta.size + unknowns.amplitude.size + unknowns.shape.size
+    return np.arange(before, before + size)
+
+
+def free_unknowns(
+    setting: Setting, places: Sequence[Place], scales: Sequence[Scales], unknowns: Unknowns
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What is estimated: places in the flattened unknowns, least and greatest values.
+
+    Args:
+        setting: structure and laws.
+        places: of the effects.
+        scales: at their ports.
+        unknowns: whose layout it is.
+    """
+    lower, upper = (list(map(float, bound)) for bound in setting.structure.bounds())
+    where = list(range(unknowns.theta.size))
+    directions = unknowns.amplitude.shape[2]
+    offset = unknowns.theta.size
+    shape_offset = offset + unknowns.amplitude.size
+    for slot, (place, scale) in enumerate(zip(places, scales, strict=True)):
+        law = setting.laws[place.law]
+        along = directions if place.port == "force" else 1
+        if not law.whole:
+            for number, amplitude in enumerate(law.amplitudes):
+                for direction in range(along):
+                    where.append(offset + (slot * AMPLITUDES + number) * directions + direction)
+                    signed = amplitude.positive and along == 1
+                    lower.append(0.0 if signed else -np.inf)
+                    upper.append(np.inf)
+        least, greatest = law.bounds(scale) if law.shapes else (np.zeros(0), np.zeros(0))
+        for number in range(len(law.shapes)):
+            where.append(shape_offset + slot * SHAPES + number)
+            lower.append(float(least[number]))
+            upper.append(float(greatest[number]))
+    starts = start_places(unknowns)
+    where += list(starts)
+    lower += [-np.inf] * starts.size
+    upper += [np.inf] * starts.size
+    return np.asarray(where), np.asarray(lower), np.asarray(upper)
+
+
+def varying(setting: Setting, places: Sequence[Place]) -> Setting:
+    """The setting, told whether a parameter varies.
+
+    Args:
+        setting: structure, laws, sample time.
+        places: of the effects.
+    """
+    wanted = any(place.port == "parameter" for place in places)
+    return Setting(setting.structure, setting.laws, setting.dt, wanted)
+
+
+def fit(
+    setting: Setting,
+    records: Records,
+    places: Sequence[Place],
+    scales: Sequence[Scales],
+    unknowns: Unknowns,
+    noise: np.ndarray,
+    *,
+    ratio: float = RATIOS[-2],
+    cycles: int = 8,
+    steps: int = 12,
+) -> Fitted:
+    """Parameters, effects and initial states by likelihood, the diffusion by likelihood too.
+
+    Args:
+        setting: structure, laws, sample time.
+        records: estimation data.
+        places: of the effects.
+        scales: at their ports.
+        unknowns: where to start.
+        noise: standard deviation of the outputs' noise (ny,).
+        ratio: diffusion to start with.
+        cycles: how often diffusion and parameters take turns at most.
+        steps: of each search.
+    """
+    setting = varying(setting, places)
+    slots = slots_of(setting.structure, places, records.schedules.shape[1])
+    where, lower, upper = free_unknowns(setting, places, scales, unknowns)
+    spread = jnp.asarray(noise)
+
+    def gain_of(values, level):
+        return _gains(setting, records, values.theta, spread, jnp.asarray(float(level)))
+
+    def choose(values, near):
+        at = RATIOS.index(near)
+        # Far off, the optimum is worth a look only when a neighbour is better.
+        ratios = RATIOS[max(at - 2, 0) : at + 2]
+        count = int(np.sum(np.asarray(records.counts)))
+        scored = []
+        for level in ratios:
+            gain = gain_of(values, level)
+            errors = np.asarray(run(setting, records, slots, values, gain).innovations)[:count]
+            scored.append(log_likelihood(errors))
+        return ratios[int(np.argmax(scored))]
+
+    found, before = None, -np.inf
+    for _ in range(cycles):
+        gain = gain_of(unknowns, ratio)
+        found = search(setting, records, slots, unknowns, gain, where, lower, upper, steps=steps)
+        unknowns, following = found.unknowns, choose(found.unknowns, ratio)
+        if following == ratio or found.log_likelihood < before + _WORTH:
+            break
+        ratio, before = following, found.log_likelihood
+    assert found is not None
+    return Fitted(
+        setting, tuple(places), tuple(scales), slots, unknowns, gain, ratio, noise, found
+    )
+
+
+def with_starts(fitted: Fitted, records: Records, gain: Array | None = None) -> Unknowns:
+    """The fitted unknowns with initial states fitted to other records.
+
+    Args:
+        fitted: the model.
+        records: as many as it was fitted to.
+        gain: L; the model's own if `None`.
+    """
+    unknowns = eqx.tree_at(
+        lambda tree: tree.start, fitted.unknowns, jnp.zeros_like(fitted.unknowns.start)
+    )
+    places = start_places(unknowns)
+    free = np.full(places.size, np.inf)
+    found = search(
+        fitted.setting,
+        records,
+        fitted.slots,
+        unknowns,
+        fitted.gain if gain is None else gain,
+        places,
+        -free,
+        free,
+        steps=4,
+        tolerance=0.1,
+    )
+    return found.unknowns
+
+
+def slow_gain(fitted: Fitted, records: Records) -> Array:
+    """A gain of a hundredth of the fitted diffusion.
+
+    Args:
+        fitted: the model.
+        records: the nodes of κ.
+    """
+    return _gains(
+        fitted.setting,
+        records,
+        fitted.unknowns.theta,
+        jnp.asarray(fitted.noise),
+        jnp.asarray(_SLOW * fitted.ratio),
+    )
