@@ -19,13 +19,11 @@ import argparse
 import json
 import multiprocessing
 import tempfile
-import time
-import traceback
 from pathlib import Path
 
-import numpy as np
 from tqdm import tqdm
 
+from benchmarks.blind_suite._answer import answer_job
 from benchmarks.blind_suite._generate import Record, generate, load, save
 from benchmarks.blind_suite._plants import PLANTS
 from benchmarks.blind_suite._score import (
@@ -37,86 +35,6 @@ from benchmarks.blind_suite._score import (
     score_rows,
 )
 from lpvid.report import text_table
-
-DENIED = {"status": "", "verdict": "failed", "effects": [], "held_out": [], "seconds": np.nan}
-
-
-def solve(record: Record, structure: str | None, told: list[str] | None = None) -> dict:
-    """One record through `close_the_loop`, as plain numbers; a failure becomes its status.
-
-    Args:
-        record: what the solver may see.
-        structure: name of the model structure, the record's own by default.
-        told: names of the effects, for the oracle.
-    """
-    start = time.perf_counter()
-    try:
-        from lpvid.data import IOData
-        from lpvid.loop import close_the_loop
-
-        data = IOData(
-            u=record.u,
-            y=record.y,
-            dt=record.dt,
-            kappa=record.kappa,
-            names={"u": record.input_names, "y": record.output_names},
-            units={"u": record.input_units, "y": record.output_units},
-        )
-        options = {} if told is None else {"laws": _laws(told)}
-        loop = close_the_loop(_structure(structure or record.structure, data), data, **options)
-    except Exception as error:
-        status = "".join(traceback.format_exception_only(error)).strip()
-        where = traceback.format_exc(limit=-3)
-        seconds = time.perf_counter() - start
-        return {"key": record.key, **DENIED, "status": status, "trace": where, "seconds": seconds}
-    return {
-        "key": record.key,
-        "status": "ok",
-        "verdict": loop.verdict,
-        "effects": [
-            {
-                "name": effect.name,
-                "family": effect.family,
-                "port": effect.port,
-                "parameters": [number._asdict() for number in effect.parameters],
-                "confusable_with": list(effect.confusable_with),
-                "gain": float(effect.gain),
-                "held_out_gain": float(effect.held_out_gain),
-                "p_value": float(effect.p_value),
-            }
-            for effect in loop.effects
-        ],
-        "held_out": np.asarray(loop.after.horizon).tolist(),
-        "before": np.asarray(loop.before.horizon).tolist(),
-        "free_run": np.asarray(loop.after.free_run).tolist(),
-        "noise_floor": np.asarray(loop.noise_floor).tolist(),
-        "p_value": float(loop.p_value),
-        "p_value_left": float(loop.p_value_left),
-        "first_round": [
-            [c.name, c.port, float(c.gain)] for c in (loop.rounds[0] if loop.rounds else ())[:5]
-        ],
-        "seconds": time.perf_counter() - start,
-    }
-
-
-def _structure(name: str, data):
-    from lpvid.loop import structures
-
-    found = [kind for kind in vars(structures).values() if getattr(kind, "name", None) == name]
-    if not found:
-        raise ValueError(f"structure={name!r}: lpvid.loop.structures has none of this name.")
-    return found[0](data)
-
-
-def _laws(names: list[str]) -> tuple:
-    """The laws of these names alone."""
-    from lpvid.effects import LIBRARY
-
-    return tuple(law for law in LIBRARY if law.name in names)
-
-
-def _job(job) -> dict:
-    return solve(*job)
 
 
 def _answers(path: Path) -> dict[str, dict]:
@@ -135,7 +53,7 @@ def run(jobs: list, path: Path, processes: int) -> None:
     # Spawned: a process that has started JAX must not be forked.
     context = multiprocessing.get_context("spawn")
     with context.Pool(processes) as pool, path.open("a") as file:
-        for answer in tqdm(pool.imap_unordered(_job, jobs), total=len(jobs), unit="record"):
+        for answer in tqdm(pool.imap_unordered(answer_job, jobs), total=len(jobs), unit="record"):
             file.write(json.dumps(answer) + "\n")
             file.flush()
 

@@ -208,7 +208,8 @@ def choices(plant: Plant, draft: _Draft) -> list[str]:
     # A loop that is closed about a sensor without sign runs away.
     if not draft.closed:
         names += ["absolute-value-sensor"]
-    if plant.elastic:
+    # The library's two-link arm has ports at its joints only.
+    if plant.elastic and plant.structure != "two-link-arm":
         names += ["cubic-stiffness", "quadratic-stiffness", "play", "bouc-wen"]
     if plant.structure == "flexible-joint":
         names += ["backlash", "load-dependent", "position-dependent-inertia", "centrifugal"]
@@ -359,6 +360,9 @@ def draw_effect(name, plant: Plant, motion, sizes: _Scales, rng: np.random.Gener
         case "scheduling" | "parameter-drift":
             kind = str(rng.choice(("damping", "stiffness")))
             where = sliding if kind == "damping" else elastic
+            if where == "joint 1":
+                # The first gain is no parameter of the library's structure.
+                where = "joint 2"
             value = _own(getattr(motion, kind), plant.coordinates[where])
             label = f"{kind} at {where}"
             if plant.structure == "flexible-joint":
@@ -370,7 +374,9 @@ def draw_effect(name, plant: Plant, motion, sizes: _Scales, rng: np.random.Gener
                 label = f"{kind}[{place},{place}]"
             elif kind == "damping":
                 # The velocity loop's gain, which is the damping too.
-                kind, label = "gain", f"gain at {where}"
+                kind, label = "gain", f"velocity gain {where[-1]}"
+            else:
+                label = f"bending stiffness {where[-1]}"
             verb, over = ("scheduled", "kappa1") if name == "scheduling" else ("drifting", "time")
             shape = (value, plant.dt * SAMPLES)
             full = f"{kind}, {verb}"

@@ -217,11 +217,13 @@ def _two_link_arm(rng: np.random.Generator, decoy: bool) -> Motion:
         for name, values in groups.items()
         for i, value in enumerate(values)
     }
+    # Records show forces up to one factor: they count in units of the first gain, as the library's.
+    unit = gains[0]
     return Motion(
-        np.stack(mass),
-        np.diag(np.append(gains, [0.0, 0.0])),
-        np.diag(np.append([0.0, 0.0], 4.0 * rigidity * np.array(_LENGTHS))),
-        np.vstack([np.diag(gains), np.zeros((2, 2))]),
+        np.stack(mass) / unit,
+        np.diag(np.append(gains, [0.0, 0.0])) / unit,
+        np.diag(np.append([0.0, 0.0], 4.0 * rigidity * np.array(_LENGTHS))) / unit,
+        np.vstack([np.diag(gains), np.zeros((2, 2))]) / unit,
         outputs,
         physical | {"joint mass": joint_mass, "payload mass": payload},
     )

@@ -144,6 +144,8 @@ def metrics(
             match = next((effect for effect in found if effect["name"] == truth["name"]), None)
             if match is not None:
                 true, value, std = scored_numbers(truth, match)
+                if not true.size:
+                    continue
                 errors.append(100.0 * np.linalg.norm(value - true) / np.linalg.norm(true))
                 covered += list(np.abs(value - true) <= 1.96 * std)
         sizes += [float(len(_set_of(effect))) for effect in found]

@@ -296,6 +296,7 @@ def simulate(plant: Plant, runs: Runs, substeps: int = SUBSTEPS) -> Signals:
                     for g, first in zip(damped, [g.force for g in damped], strict=True):
                         kick[g.rows] += force_of(g, time) - first
                     v[:] = before
+                a = kick
                 if inertial or dry:
                     whole = np.concatenate([state[..., 0], drive], axis=1)
                     a = (R @ whole[..., None])[..., 0]

@@ -26,18 +26,20 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
     model = None if arguments.model is None else load(arguments.model)
     data = read_records(arguments, arguments.files, arguments.schedule)
     print(f"{data!r}")
+    split = arguments.split or SPLIT
+    test = None
     if arguments.test:
         test = read_records(arguments, arguments.test, arguments.schedule)
-        options, fitted = {"test": test}, data
-    else:
-        options = {"split": arguments.split or SPLIT}
-        fitted = data.split(options["split"])[0]
+    # What is held out takes no part in starting the structure either.
+    fitted = data.split(split)[0] if test is None else data
     if model is None:
         structure = structure_named(arguments.structure or BLACK_BOX, fitted, order=arguments.order)
     else:
         structure = PortedModel(model, fitted)
     print(f"Structure {structure.name}; fitting and testing …", flush=True)
-    found = loop.close_the_loop(structure, data, progress=sys.stderr.isatty(), **options)
+    found = loop.close_the_loop(
+        structure, data, test=test, split=split, progress=sys.stderr.isatty()
+    )
     print(f"\n{loop_text(found)}\n")
     if arguments.html is not None:
         # Pictures go to a file: no window, no display needed.

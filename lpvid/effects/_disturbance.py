@@ -4,18 +4,23 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.ndimage
 from jaxtyping import Array, Float
 
 from lpvid.effects._law import AbstractStaticLaw, Amplitude, Scales, Shape, Signals
 
 _MOST = 32
+_LOUDEST = 4
+_GROUND = 25
 
 
 class PeriodicDisturbance(AbstractStaticLaw):
     """A sinusoid in time, A sin ωt + B cos ωt: a rotor out of balance, the mains.
 
-    Nothing is heard of it half a spectral line of the record away: `lines` gives all of them, on
-    which the regressor's likelihood can be had at once; `grid` thins them out.
+    Nothing is heard of it half a spectral line of the record away, so all `lines` count as tested,
+    and `loudest` picks those worth a closer look from a residual's spectrum; `grid` thins them out
+    where there is no residual. It enters at an input: at a linear model's other ports the same
+    sinusoid would only have another amplitude and phase.
 
     Seen as: one spectral line that the input does not excite. Confused with torque ripple (follows
     the angle) and a missing mode (follows the input).
@@ -30,7 +35,7 @@ class PeriodicDisturbance(AbstractStaticLaw):
 
     name: ClassVar[str] = "periodic-disturbance"
     family: ClassVar[str] = "disturbance"
-    ports: ClassVar[tuple[str, ...]] = ("input", "force")
+    ports: ClassVar[tuple[str, ...]] = ("input",)
     amplitudes: ClassVar[tuple[Amplitude, ...]] = (
         Amplitude("A", "{acts_on}"),
         Amplitude("B", "{acts_on}"),
@@ -60,6 +65,22 @@ class PeriodicDisturbance(AbstractStaticLaw):
         lines = self.lines(scales)
         chosen = np.geomspace(1.0, lines.size, min(_MOST, lines.size)).round().astype(int) - 1
         return lines[np.unique(chosen)][:, None]
+
+    def loudest(self, residual: np.ndarray, scales: Scales) -> np.ndarray:
+        """The lines that stand out of a residual's spectrum most, (candidate, 1).
+
+        Args:
+            residual: (time, ny).
+            scales: sizes of the signals at the port.
+        """
+        lines = self.lines(scales)
+        power = np.abs(np.fft.rfft(residual / np.std(residual, axis=0), axis=0)) ** 2
+        share = np.arange(power.shape[0]) * 2.0 * np.pi / (residual.shape[0] * scales.dt)
+        total = np.interp(lines, share, np.sum(power, axis=1))
+        # What the noise's colour or another effect puts into a whole band is not a line.
+        ground = scipy.ndimage.median_filter(total, size=_GROUND, mode="nearest")
+        contrast = total / np.maximum(ground, 1e-300)
+        return lines[np.argsort(-contrast)[:_LOUDEST]][:, None]
 
     def bounds(self, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
         """From one period in the record to 0.95 of Nyquist's frequency."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lpvid.effects import Scales
+from lpvid.effects import PeriodicDisturbance, Scales
 from lpvid.loop._candidates import Place, Trial, port_signals, regressors, scales_at, signals_at
 from lpvid.loop._discretise import Sampled, sampled_at
 from lpvid.loop._program import Injection, Records, Setting, Slots, Unknowns, node_matrices
@@ -32,6 +32,7 @@ class Along(NamedTuple):
         ramp: Γ̇ at the nodes, as NumPy array.
         states: with the sample seen, and before it (time, state).
         inputs: with what effects add to them (time, nu).
+        errors: innovations, padding left out (time, ny).
     """
 
     setting: Setting
@@ -46,11 +47,12 @@ class Along(NamedTuple):
     ramp: np.ndarray
     states: tuple[Array, Array]
     inputs: Array
+    errors: np.ndarray
 
 
 @eqx.filter_jit
 def _nodes(setting, slots, unknowns, records):
-    return node_matrices(setting, slots, unknowns, records, setting.dt)
+    return node_matrices(setting, slots, unknowns, records, jnp.asarray(setting.dt))
 
 
 def along(setting: Setting, records: Records, slots: Slots, unknowns: Unknowns, gain) -> Along:
@@ -80,6 +82,7 @@ def along(setting: Setting, records: Records, slots: Slots, unknowns: Unknowns, 
         np.asarray(matrices.ramp),
         (trace.state, trace.before),
         records.u + trace.forces[:, :nu],
+        np.asarray(trace.innovations)[: int(np.sum(np.asarray(records.counts)))],
     )
 
 
@@ -95,7 +98,7 @@ def _parameter_matrices(setting: Setting, theta: Float[Array, " parameter"], nod
 
     def at(values):
         thetas = jnp.broadcast_to(values, (nodes.shape[0], values.shape[0]))
-        return sampled_at(setting.structure, thetas, nodes, setting.dt)
+        return sampled_at(setting.structure, thetas, nodes, jnp.asarray(setting.dt))
 
     return jax.vmap(lambda direction: jax.jvp(at, (theta,), (direction,))[1])(jnp.diag(theta))
 
@@ -253,5 +256,22 @@ def grid_of(trace: Along, place: Place) -> np.ndarray:
         trace: whose signals set the scales.
         place: where and which law.
     """
+    law, scales = trace.setting.laws[place.law], scales_of(trace, place)
+    if isinstance(law, PeriodicDisturbance):
+        return law.loudest(trace.errors, scales)
+    return np.asarray(law.grid(scales)) if law.shapes else np.zeros((1, 0))
+
+
+def tests_at(trace: Along, place: Place, tried: int) -> int:
+    """How many hypotheses a place stands for.
+
+    Args:
+        trace: whose signals set the scales.
+        place: where and which law.
+        tried: shapes tried there.
+    """
     law = trace.setting.laws[place.law]
-    return np.asarray(law.grid(scales_of(trace, place))) if law.shapes else np.zeros((1, 0))
+    if isinstance(law, PeriodicDisturbance):
+        # Picked from the residual's own spectrum: every line was looked at.
+        return law.lines(scales_of(trace, place)).size
+    return tried

@@ -43,7 +43,7 @@ class Sampled(eqx.Module):
     load_input: Float[Array, "*node coordinate nu"]
 
 
-def sampled(ports: Ports, dt: float) -> Sampled:
+def sampled(ports: Ports, dt: Float[Array, ""]) -> Sampled:
     """The matrices of one sample of `dt` seconds.
 
     Args:
@@ -76,7 +76,7 @@ def sampled_at(
     structure: AbstractPortedStructure,
     theta: Float[Array, "node parameter"],
     kappa: Float[Array, "node nk"],
-    dt: float,
+    dt: Float[Array, ""],
 ) -> Sampled:
     """Sampled matrices at several nodes of parameters and scheduling.
 

@@ -57,5 +57,5 @@ def gains(
     """
     nodes = records.kappa_nodes
     thetas = jnp.broadcast_to(theta, (nodes.shape[0], theta.shape[0]))
-    matrices = sampled_at(setting.structure, thetas, nodes, setting.dt)
+    matrices = sampled_at(setting.structure, thetas, nodes, jnp.asarray(setting.dt))
     return jax.vmap(lambda m: _gain(m, noise, ratio))(matrices)

@@ -20,7 +20,8 @@ AMPLITUDES = 2
 SHAPES = 2
 
 SUBSTEPS = 4
-"""Steps that a sample is taken in: a law that holds a body still needs them shorter."""
+"""Steps that a sample is taken in where there are effects: a law that holds a body still needs
+them shorter."""
 
 
 def path_rule(spots: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -203,7 +204,7 @@ def moments(values: Float[Array, "fraction *rest"]) -> tuple[Array, Array]:
 
 
 def node_matrices(
-    setting: Setting, slots: Slots, unknowns: Unknowns, records: Records, step: float
+    setting: Setting, slots: Slots, unknowns: Unknowns, records: Records, step: Float[Array, ""]
 ) -> tuple[Sampled, Float[Array, "time all_nodes"]]:
     """Matrices at the nodes of κ and, where parameters vary, of their schedules; with weights.
 
@@ -252,7 +253,7 @@ def trace(
 ) -> Trace:
     """Run the predictor over the records.
 
-    Each sample: ŷ = C x + D u with the sensors' effects; `SUBSTEPS` exponential steps from x with
+    Each sample: ŷ = C x + D u with the sensors' effects; exponential steps from x (`SUBSTEPS`) with
     the effects along the way, a straight line over each step; and Φ L (y − ŷ) added at the end.
     With a gain of zero it is a simulation.
 
@@ -265,7 +266,9 @@ def trace(
         injection: added signals, usually zero.
     """
     evaluate = laws_of(setting.laws)
-    fine = setting.dt / SUBSTEPS
+    # Without effects one step is exact.
+    substeps = jnp.where(slots.used > 0, SUBSTEPS, 1)
+    fine = setting.dt / substeps.astype(float)
     matrices, node_weights = node_matrices(setting, slots, unknowns, records, fine)
     nu, ny = records.u.shape[1], records.y.shape[1]
     coordinates, directions = slots.force.shape[1], unknowns.amplitude.shape[2]
@@ -305,7 +308,7 @@ def trace(
         def one(slot, so_far):
             drive, output, next_memory = so_far
             here = at_slot(slot, path, time + after)
-            centre = at_slot(slot, middle, time + jnp.full(1, 0.5 * fine))
+            centre = at_slot(slot, middle, time + 0.5 * fine[None])
             values, following = evaluate(
                 slots.law[slot],
                 here,
@@ -313,7 +316,7 @@ def trace(
                 after,
                 unknowns.shape[slot],
                 memory[slot],
-                jnp.asarray(fine),
+                fine,
             )
             total = values @ unknowns.amplitude[slot]
             pushed = (slots.force[slot][None, :, None] * total[:, None, :]).reshape(total.shape[0], -1)
@@ -338,28 +341,34 @@ def trace(
         drive = jnp.where(first > 0.0, 0.0, drive)
         held = jnp.concatenate([u, jnp.zeros(coordinates * directions)])
 
-        def fraction(state, number):
+        def fraction(number, state):
             # Laws are read on the way that the model takes by itself, with the last forces; a
             # correction by the innovation would only be another predictor's gain.
-            x, memory, drive = state
+            x, memory, drive, said, first_drive, total = state
             free = M.transition @ x
             end = free + M.drive @ (held + drive)
-            begun = time + fine * number
+            begun = time + fine * jnp.asarray(number, float)
             along, sensed, following = contributions(M, x, end, memory, u, history, begun)
             level, change = moments(along)
             moved = free + M.drive @ (held + level) + M.ramp @ change
-            return (moved, following, level + change), (sensed, level)
+            said = jnp.where(number == 0, sensed, said)
+            first_drive = jnp.where(number == 0, level, first_drive)
+            return moved, following, level + change, said, first_drive, total + level
 
-        (moved, following, drive), (sensed, levels) = lax.scan(
-            fraction, (x, memory, drive), jnp.arange(float(SUBSTEPS))
+        moved, following, drive, sensed, pushed, total = lax.fori_loop(
+            0,
+            substeps,
+            fraction,
+            (x, memory, drive, jnp.zeros(ny), jnp.zeros_like(drive), jnp.zeros_like(drive)),
         )
-        error = y - (M.C @ x + M.D @ (u + levels[0, :nu]) + sensed[0] + added_y)
-        correction = L @ error
-        for _ in range(SUBSTEPS):
-            correction = M.transition @ correction
+        error = y - (M.C @ x + M.D @ (u + pushed[:nu]) + sensed + added_y)
+        correction = lax.fori_loop(
+            0, substeps, lambda _, moving: M.transition @ moving, L @ error
+        )
         # Added here, so that a sensitivity sees it as one more force over the sample.
         ahead = moved + correction + added_x
-        out = (error, x, x + L @ error, moved, jnp.mean(levels, axis=0), memory)
+        mean = total / substeps.astype(float)
+        out = (error, x, x + L @ error, moved, mean, memory)
         return (ahead, following, drive), out
 
     samples = (

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
+from lpvid.effects import AbstractLaw
 from lpvid.loop._candidates import Place, Trial, places_of
-from lpvid.loop._columns import along, force_columns, scales_of, trial_columns
+from lpvid.loop._columns import along, force_columns, scales_of, tests_at, trial_columns
 from lpvid.loop._compare import better, sample_likelihood
 from lpvid.loop._program import SLOTS, Records, Unknowns
 from lpvid.loop._score import Scored, ScoreTest, family_wise
@@ -21,6 +22,9 @@ _ALIKE = 0.95
 """Cosine between projected sensitivities from which two effects are taken for one another."""
 
 _REFITTED = 3
+_HOPEFUL = 0.3
+"""Share of the best gain from which a candidate, its shape once free, could still win."""
+
 _REALISED = 0.5
 """Share of the promised gain below which a refit counts as a failed search, not as evidence."""
 
@@ -71,12 +75,12 @@ def rank(fitted: Fitted, records: Records, schedules: Sequence[str]) -> Ranking:
     trace = along(setting, records, fitted.slots, fitted.unknowns, fitted.gain)
     taken = set(fitted.places)
     places = [p for p in places_of(setting.structure, setting.laws, schedules) if p not in taken]
-    tests = 0
+    tried: dict[Place, int] = {}
     test = ScoreTest(fitted.searched.errors, fitted.searched.columns)
     samples = fitted.searched.errors.shape[0]
     best: dict[Place, Ranked] = {}
     for trial, columns in trial_columns(trace, places):
-        tests += 1
+        tried[trial.place] = tried.get(trial.place, 0) + 1
         law = setting.laws[trial.place.law]
         directions = columns.shape[2] // len(law.amplitudes)
         positive = np.array([a.positive and directions == 1 for a in law.amplitudes])
@@ -91,6 +95,7 @@ def rank(fitted: Fitted, records: Records, schedules: Sequence[str]) -> Ranking:
     entries = sorted(best.values(), key=lambda entry: -entry.penalised)
     least = min((entry.scored.p_value for entry in entries), default=1.0)
     general = _general(trace, test)
+    tests = sum(tests_at(trace, place, count) for place, count in tried.items())
     return Ranking(
         tuple(entries), test, tests, family_wise(least, max(tests, 1)), general
     )
@@ -183,19 +188,35 @@ def with_effect(fitted: Fitted, records: Records, entry: Ranked) -> Fitted:
         records: estimation data.
         entry: the candidate.
     """
-    law = fitted.setting.laws[entry.trial.place.law]
-    trace = along(fitted.setting, records, fitted.slots, fitted.unknowns, fitted.gain)
-    scales = scales_of(trace, entry.trial.place)
+    law, place = fitted.setting.laws[entry.trial.place.law], entry.trial.place
     unknowns = _seated(fitted.unknowns, len(fitted.places), entry, law.whole)
-    return fit(
-        fitted.setting,
-        records,
-        (*fitted.places, entry.trial.place),
-        (*fitted.scales, scales),
-        unknowns,
-        fitted.noise,
-        ratio=fitted.ratio,
-    )
+    model = fitted
+    for _ in range(2):
+        trace = along(model.setting, records, model.slots, model.unknowns, model.gain)
+        scales = (*fitted.scales, scales_of(trace, place))
+        model = fit(
+            fitted.setting,
+            records,
+            (*fitted.places, place),
+            scales,
+            unknowns,
+            fitted.noise,
+            ratio=model.ratio,
+        )
+        if not _cramped(model, law):
+            break
+        # The better predictor sees its signals with less noise, which widens the bounds.
+        unknowns = model.unknowns
+    return model
+
+
+def _cramped(model: Fitted, law: AbstractLaw) -> bool:
+    """Whether a shape of the newest effect sits at its bound."""
+    if not law.shapes:
+        return False
+    lower, upper = law.bounds(model.scales[-1])
+    shape = np.asarray(model.unknowns.shape[len(model.places) - 1])[: len(law.shapes)]
+    return bool(np.any((shape <= 1.001 * lower) | (shape >= 0.999 * upper)))
 
 
 def without(fitted: Fitted, records: Records, slot: int) -> Fitted:
@@ -247,7 +268,8 @@ def choose(
         return None
     before = likelihood_on(fitted, held_out_errors(fitted, held_out))
     tried: list[tuple[Ranked, Fitted, np.ndarray]] = []
-    for entry in significant[:_REFITTED]:
+    hopeful = [e for e in significant if e.scored.gain >= _HOPEFUL * significant[0].scored.gain]
+    for entry in hopeful[:_REFITTED]:
         refitted = with_effect(fitted, records, entry)
         realised = refitted.searched.log_likelihood - fitted.searched.log_likelihood
         if realised < _REALISED * min(entry.scored.gain, 50.0):

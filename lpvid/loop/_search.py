@@ -196,7 +196,7 @@ def search(
     upper: np.ndarray,
     *,
     steps: int = 20,
-    tolerance: float = 1e-2,
+    tolerance: float = 3e-2,
 ) -> Searched:
     """Maximise the likelihood of the innovations over the unknowns at `places`.
 

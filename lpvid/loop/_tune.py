@@ -223,7 +223,7 @@ def with_starts(fitted: Fitted, records: Records, gain: Array | None = None) -> 
         places,
         -free,
         free,
-        steps=4,
+        steps=3,
         tolerance=0.1,
     )
     return found.unknowns

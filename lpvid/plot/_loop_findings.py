@@ -22,8 +22,8 @@ from lpvid.plot._figure import (
     with_unit,
 )
 
-# Points of a cloud, and bins of its means.
-_CLOUD, _BINS = 3000, 30
+# Points of a cloud, bins of its means, points of a law's curve.
+_CLOUD, _BINS, _LAW = 3000, 30, 300
 
 
 @styled
@@ -194,8 +194,14 @@ def _draw_force(panel: Any, force: VirtualForce) -> None:
             color=DATA_COLOUR,
             label="mean",
         )
-    path = order if _is_function(law[order]) else np.arange(where.size)
-    panel.plot(where[path], law[path], color=colour(0), linewidth=1.3, label="law found")
+    if _is_function(law[order]):
+        # Means of neighbours: a steep law of a noisy speed would be drawn up and down.
+        parts = np.array_split(order, min(_LAW, order.size)) if order.size else []
+        curve = [(np.mean(where[part]), np.mean(law[part])) for part in parts]
+    else:
+        curve = np.stack([where, law], axis=1)
+    drawn = np.asarray(curve, float).reshape(-1, 2)
+    panel.plot(drawn[:, 0], drawn[:, 1], color=colour(0), linewidth=1.3, label="law found")
     # Noise may reach far beyond; the law and the bulk of the cloud are what is to be seen.
     if where.size:
         ends = np.append(np.percentile(lacking, [0.5, 99.5]), [law.min(), law.max()])
@@ -211,16 +217,15 @@ def _is_function(law: np.ndarray) -> bool:
     """Whether values in the order of their regressor make one curve and no loops."""
     if law.size < 3:
         return True
-    reach = float(np.ptp(law))
-    # A smooth curve rises and falls by a few times its range; loops jump at every sample.
-    return float(np.sum(np.abs(np.diff(law)))) <= 10.0 * reach
+    # Neighbours lie on one branch, or by turns on the two branches of a loop.
+    return float(np.median(np.abs(np.diff(law)))) <= 0.05 * float(np.ptp(law))
 
 
 def _draw_candidate(
     panel: Any, place: int, candidate: Candidate, named: set[tuple[str, str]], alike: set[str]
 ) -> None:
     chosen = (candidate.name, candidate.port) in named
-    same = any(_means(text, candidate) for text in alike)
+    same = f"{candidate.name} at {candidate.port}" in alike
     panel.barh(
         place,
         candidate.penalised,
@@ -239,9 +244,3 @@ def _draw_candidate(
         fontsize=7.0,
         color=DATA_COLOUR,
     )
-
-
-def _means(text: str, candidate: Candidate) -> bool:
-    """Whether "name at port" speaks of this candidate; a force's port may leave "force at" out."""
-    port = candidate.port.removeprefix("force at ")
-    return text in (f"{candidate.name} at {candidate.port}", f"{candidate.name} at {port}")

@@ -17,12 +17,12 @@ from lpvid.report._loop_words import (
     errors_of,
     estimate,
     headline,
+    output_unit,
     probability,
     quantity,
     summary,
     tests,
     title,
-    unit,
 )
 from lpvid.report._report import Report
 
@@ -120,7 +120,7 @@ def _effects(page: Report, loop: Loop) -> Report:
         certain = "Nothing else in the library looks like it on these records."
         page = page.paragraph(" ".join(doubts(effect)) or certain)
     if loop.ablation:
-        names = [quantity(n, unit(loop, k, True)) for k, n in enumerate(loop.output_names)]
+        names = [quantity(n, output_unit(loop, k, True)) for k, n in enumerate(loop.output_names)]
         caption = f"Error {ahead(loop)} ahead, held-out, when one effect is taken out again"
         page = page.table(ablation_rows(loop), ["effects", *names], caption)
     return page

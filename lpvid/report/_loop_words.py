@@ -68,19 +68,20 @@ def summary(loop: Loop) -> str:
         if not (np.isfinite(before) and np.isfinite(after)):
             continue
         floor = float(loop.noise_floor[k])
-        least = f"; noise alone makes {quantity(floor, unit(loop, k))}" if floor > 0.0 else ""
+        noise = quantity(floor, output_unit(loop, k))
+        least = f"; noise alone makes {noise}" if floor > 0.0 else ""
         if loop.effects and before > 0.0:
             change = 100.0 * (after - before) / before
             sign = "−" if change < 0.0 else "+"
             sentences.append(
                 f"Predicted {ahead(loop)} ahead, {name} was wrong by "
-                f"{quantity(before, unit(loop, k))} (RMS) and is now wrong by "
-                f"{quantity(after, unit(loop, k))} ({sign}{abs(change):.0f} %){least}."
+                f"{quantity(before, output_unit(loop, k))} (RMS) and is now wrong by "
+                f"{quantity(after, output_unit(loop, k))} ({sign}{abs(change):.0f} %){least}."
             )
         else:
             sentences.append(
                 f"Predicted {ahead(loop)} ahead, {name} is wrong by "
-                f"{quantity(before, unit(loop, k))} (RMS){least}."
+                f"{quantity(before, output_unit(loop, k))} (RMS){least}."
             )
     return " ".join(sentences)
 
@@ -103,10 +104,16 @@ def doubts(effect: FoundEffect) -> list[str]:
     """What cannot be told from the effect, and what record would."""
     if not effect.confusable_with:
         return []
-    found = [f"These records cannot tell it from {listed(effect.confusable_with, 'or')}."]
+    names = [place(name) for name in effect.confusable_with]
+    found = [f"These records cannot tell it from {listed(names, 'or')}."]
     if effect.separating_input:
         found.append(f"To tell them apart: {effect.separating_input}.")
     return found
+
+
+def place(label: str) -> str:
+    """`coulomb at load` of `coulomb at force at load`."""
+    return label.replace(" at force at ", " at ").replace(" at input ", " at ")
 
 
 def error_rows(loop: Loop, k: int) -> list[list[Any]]:
@@ -137,12 +144,13 @@ def floor_bft(loop: Loop) -> np.ndarray:
 def errors_of(loop: Loop, k: int) -> str:
     """Caption of the errors of output k."""
     first, last = loop.held_out
-    return f"{quantity(loop.output_names[k], unit(loop, k, True))}, held-out samples {first}–{last}"
+    name = quantity(loop.output_names[k], output_unit(loop, k, True))
+    return f"{name}, held-out samples {first}–{last}"
 
 
 def ablation_rows(loop: Loop) -> list[list[Any]]:
     """Error over the horizon with all effects, and without each of them."""
-    names = ["with all", *(f"without {name}" for name in loop.ablation)]
+    names = ["with all", *(f"without {place(name)}" for name in loop.ablation)]
     values = [loop.after.horizon, *loop.ablation.values()]
     return [
         [name, *(known(one) for one in np.asarray(value, float))]
@@ -153,18 +161,20 @@ def ablation_rows(loop: Loop) -> list[list[Any]]:
 def estimate(number: EstimatedNumber) -> str:
     """Value and half its 95 % interval, to as many digits as the interval says, with unit."""
     half = _NORMAL_95 * number.std
+    # A pure number, or one of signals without units.
+    unit = "" if number.unit == "1" else number.unit
     value = float(number.value)
     if not np.isfinite(half):
-        return f"{quantity(value, number.unit)} (undecided)"
+        return f"{quantity(value, unit)} (undecided)"
     if half <= 0.0 or not np.isfinite(value):
-        return quantity(value, number.unit)
+        return quantity(value, unit)
     digits = 1 - int(np.floor(np.log10(half)))
     if 0 <= digits <= 6 and abs(value) < 1e6:
         text = f"{value:.{digits}f} ± {half:.{digits}f}"
     else:
         places = max(0, digits + int(np.floor(np.log10(max(abs(value), half)))))
         text = f"{value:.{min(places, 15)}e} ± {half:.1e}"
-    return f"{text} {number.unit}".rstrip()
+    return f"{text} {unit}".rstrip()
 
 
 def quantity(value: float | str, unit: str) -> str:
@@ -173,7 +183,7 @@ def quantity(value: float | str, unit: str) -> str:
     return f"{text} {unit}".rstrip()
 
 
-def unit(loop: Loop, k: int, brackets: bool = False) -> str:
+def output_unit(loop: Loop, k: int, brackets: bool = False) -> str:
     """Unit of output k, in brackets after a name; empty where it has none."""
     found = loop.output_units[k]
     return f"({found})" if found and brackets else found

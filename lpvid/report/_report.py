@@ -272,6 +272,9 @@ figure { margin: 1rem 0; }
 img { display: block; max-width: 100%; height: auto; background: #ffffff;
   border: 1px solid var(--line); border-radius: 6px; }
 figcaption { color: var(--soft); font-size: .9rem; margin-top: .3rem; }
-@media (max-width: 30rem) { th, td { padding: .3rem .45rem; } }
+@media (max-width: 30rem) {
+  th, td { padding: .3rem .45rem; }
+  td:first-child { white-space: normal; }
+}
 @media print { main { max-width: none; } figure, tr { break-inside: avoid; } }
 """

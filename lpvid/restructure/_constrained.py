@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -21,12 +22,15 @@ class ConstrainedStructure(AbstractStructure):
         selection: its parameters from the chosen ones.
         lower: lower bounds of all its parameters.
         upper: upper bounds.
+        members: indices of the parameters that each chosen one stands for, without those that
+            bounds leave one value.
     """
 
     structure: AbstractStructure
     selection: Selection
     lower: Float[Array, " parameter"]
     upper: Float[Array, " parameter"]
+    members: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -58,6 +62,8 @@ class ConstrainedStructure(AbstractStructure):
     def restored(self, found: Restructured) -> Restructured:
         """The result in the structure's own parameters."""
         matrix, certificate = self.selection.matrix, found.certificate
+        names, members = self.structure.parameter_names, self.members
+        free = {index for group in members for index in group}
         if certificate is not None:
             certificate = replace(
                 certificate,
@@ -69,6 +75,8 @@ class ConstrainedStructure(AbstractStructure):
             structure=self.structure,
             parameters=self.selection.values(found.parameters),
             certificate=certificate,
+            fixed=tuple(name for index, name in enumerate(names) if index not in free),
+            tied=tuple(tuple(names[k] for k in group) for group in members if len(group) > 1),
         )
 
 
@@ -94,6 +102,7 @@ def constrain(
         values[matching(names, pattern, "fixed")] = float(value)
     selection = select(names, jnp.asarray(values), tuple(fixed or ()), tied)
     lower, upper = structure.bounds()
+    single: set[int] = set()
     for pattern, ends in (bounds or {}).items():
         low, high = (float(end) for end in ends)
         rows = matching(names, pattern, "bounds")
@@ -103,9 +112,12 @@ def constrain(
             raise ValueError(
                 f"bounds[{pattern!r}]: names a parameter that is fixed; leave one of the two out."
             )
+        single = single.difference(rows).union(rows if low == high else ())
         at = jnp.asarray(rows)
         lower, upper = lower.at[at].set(low), upper.at[at].set(high)
-    constrained = ConstrainedStructure(structure, selection, lower, upper)
+    columns = [np.flatnonzero(column).tolist() for column in np.asarray(selection.matrix).T]
+    members = tuple(tuple(group) for group in columns if not single.intersection(group))
+    constrained = ConstrainedStructure(structure, selection, lower, upper, members)
     low, high = constrained.bounds()
     if not isinstance(low, Tracer) and not np.all(np.asarray(low) <= np.asarray(high)):
         raise ValueError("bounds, tied: no value is left for parameters that share one.")

@@ -1,6 +1,6 @@
 """Parameters that a model's response says nothing about, by name."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax
@@ -10,6 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from lpvid.models import AbstractStructure
+from lpvid.refinement import Ties, select
 from lpvid.restructure._matching import Target, channel_weights, make_target, response_error
 
 # A move that leaves the response within this share of its size is one that it does not see.
@@ -32,6 +33,7 @@ class Identifiability(eqx.Module):
         directions: the combinations that it does not tell, in units of the parameters: moving
             along a row changes nothing to first order. The largest entry of each row is one in
             shares of the parameter's own size.
+        groups: indices of the parameters that share one value.
     """
 
     structure: AbstractStructure
@@ -40,6 +42,7 @@ class Identifiability(eqx.Module):
     singular_values: Float[Array, " free"]
     rank: Int[Array, ""]
     directions: Float[Array, "unseen parameter"]
+    groups: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -60,16 +63,20 @@ class Identifiability(eqx.Module):
         return tuple(self._sentence(share) for share in self._shares())
 
     def _sentence(self, share: np.ndarray) -> str:
-        part = np.flatnonzero(np.abs(share) > _PART)
-        names = [self.structure.parameter_names[index] for index in part]
+        every = np.flatnonzero(np.abs(share) > _PART)
+        together = {group[0]: group for group in self.groups}
+        others = {index for group in self.groups for index in group[1:]}
+        part = np.array([index for index in every if index not in others])
+        all_names = self.structure.parameter_names
+        names = [" = ".join(all_names[k] for k in together.get(i, (i,))) for i in part]
         values, point = share[part], np.asarray(self.parameters)
         listed = _listed(names)
         if part.size == 1:
             return f"{listed} does not enter the response: fix it."
         # All by one factor (or its reciprocal), with the parameters' signs kept.
-        if np.all(np.abs(point[part]) > 0.0):
+        if np.all(np.abs(point[every]) > 0.0):
             scaled = point.copy()
-            scaled[part] = point[part] * _FACTOR**values
+            scaled[every] = point[every] * _FACTOR ** share[every]
             if self._unseen(scaled):
                 return self._scaling(names, values)
         added = point + share * _sizes(point) * (_FACTOR - 1.0)
@@ -124,6 +131,8 @@ def identifiability(
     *,
     omega: ArrayLike | Sequence | None = None,
     tolerance: float = 1e-8,
+    fixed: Iterable[str] = (),
+    tied: Ties = (),
 ) -> Identifiability:
     """Which combinations of the parameters the frequency response does not tell, at one point.
 
@@ -137,12 +146,13 @@ def identifiability(
         omega: frequencies that the data cover, rad/s; a grid around the model's poles by default.
         tolerance: singular values below this share of the largest count as zero. Raise it to ask
             what noisy data tell: 1e-3, say, for a model good to a thousandth.
-
-    Parameters that the structure's bounds fix (lower equal to upper) are not asked about.
+        fixed: names of parameters that are known (patterns with * and ?), and not asked about; nor
+            are those that the structure's bounds fix (lower equal to upper).
+        tied: names of parameters that share one value: a pattern, or several patterns, a group.
 
     Raises:
-        ValueError: the number of parameters is not the structure's, one is not finite, or the
-            call is inside `jit`.
+        ValueError: the number of parameters is not the structure's, one is not finite, a pattern
+            matches nothing, or the call is inside `jit`.
 
     Example:
         >>> def spring(p):
@@ -166,32 +176,35 @@ def identifiability(
         grid = make_target(structure.matrices(point), 60, np.inf).omega
     else:
         grid = jnp.atleast_1d(jnp.asarray(omega, float))
-    lower, upper = (np.asarray(bound) for bound in structure.bounds())
-    free = np.flatnonzero(upper > lower)
     if not np.all(np.isfinite(grid)):
         raise ValueError(
             "omega: no grid follows from poles at zero alone; give frequencies, rad/s."
         )
-    if free.size == 0:
+    selection = select(structure.parameter_names, point, tuple(fixed), tied)
+    moves = np.asarray(selection.matrix)
+    lower, upper = (np.asarray(bound) for bound in structure.bounds())
+    moves = moves[:, ~np.any(moves[upper <= lower] > 0.0, axis=0)]
+    if moves.shape[1] == 0:
         raise ValueError("structure: its bounds leave no parameter free.")
-    sizes = _sizes(np.asarray(point))
-    shares = (np.asarray(_jacobian(structure, point, grid)) * sizes[None])[:, free]
+    sizes = np.max(moves * _sizes(np.asarray(point))[:, None], axis=0)
+    shares = np.asarray(_jacobian(structure, point, grid)) @ moves * sizes[None]
     length = np.linalg.norm(shares, axis=0)
     length = np.where(length > tolerance * np.max(length), length, np.inf)
     values, right = np.linalg.svd(shares / length[None], full_matrices=True)[1:]
-    values = np.concatenate([values, np.zeros(free.size - values.shape[0])])
+    values = np.concatenate([values, np.zeros(sizes.size - values.shape[0])])
     rank = int(np.sum(values > tolerance * max(values[0], np.finfo(float).tiny)))
     # A parameter without any effect has a zero column, and keeps its own size.
     scale = np.where(np.isfinite(length), length, 1.0)
-    directions = np.zeros((free.size - rank, point.shape[0]))
-    directions[:, free] = _sparse(right[rank:] / scale[None])
+    directions = _sparse(right[rank:] / scale[None]) * sizes[None]
+    groups = (tuple(np.flatnonzero(column).tolist()) for column in moves.T)
     return Identifiability(
         structure=structure,
         parameters=point,
         omega=grid,
         singular_values=jnp.asarray(values),
         rank=jnp.asarray(rank),
-        directions=jnp.asarray(directions * sizes[None]),
+        directions=jnp.asarray(directions @ moves.T),
+        groups=tuple(group for group in groups if len(group) > 1),
     )
 
 

@@ -1,6 +1,7 @@
 """Restructuring: from a black box to a structured model by the H∞ norm (001, section 2)."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -114,13 +115,15 @@ def restructure(
         weighting = filter_response(weight, grid, black_box.ny)
         target = Target(grid, black_box.frequency_response(grid), None, None, weighting)
     constrained = constrain(structure, bounds, fixed, tied)
+    lines = None if omega is None else target.omega
     if constrained is None:
-        return run_stages(target, structure, search, scattered, given, method, stable)
+        found = run_stages(target, structure, search, scattered, given, method, stable)
+        return replace(found, omega=lines)
     given = None if given is None else jax.vmap(constrained.reduced)(given)
     if scattered is not None and search is structure:
         search, scattered = constrained, jax.vmap(constrained.reduced)(scattered)
     found = run_stages(target, constrained, search, scattered, given, method, stable)
-    return constrained.restored(found)
+    return replace(constrained.restored(found), omega=lines)
 
 
 def restructure_along(

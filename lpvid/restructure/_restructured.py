@@ -29,6 +29,9 @@ class Restructured(eqx.Module):
         minima: how many distinct minima the starts ended in (those that converged); None for a
             result that no search made.
         certificate: of the minimum; None where the non-smooth stage was left out.
+        omega: the frequencies that it was matched at; None where those are all.
+        fixed: names of the parameters that were given.
+        tied: names of those that share one value, a tuple for each group.
     """
 
     structure: AbstractStructure
@@ -42,6 +45,9 @@ class Restructured(eqx.Module):
     status: Status
     minima: Int[Array, "*batch"] | None = None
     certificate: Certificate | None = None
+    omega: Float[Array, "*batch frequency"] | None = None
+    fixed: tuple[str, ...] = eqx.field(static=True, default=())
+    tied: tuple[tuple[str, ...], ...] = eqx.field(static=True, default=())
 
     @property
     def model(self) -> StateSpace:
@@ -58,5 +64,15 @@ class Restructured(eqx.Module):
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
-        """Names of parameters that no response tells; `identifiability` says which combinations."""
-        return identifiability(self.structure, self.parameters).names
+        """Names of parameters that the response at `omega` does not tell, with what was given.
+
+        `identifiability` says which combinations.
+        """
+        seen = identifiability(
+            self.structure,
+            self.parameters,
+            omega=self.omega,
+            fixed=self.fixed,
+            tied=self.tied,
+        )
+        return seen.names

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from lpvid._results import Solution, Status
+from lpvid._results import Status
 from lpvid.analysis import HinfNorm
 from lpvid.models import AbstractStructure
 from lpvid.restructure._bundle import descend_nonsmooth
@@ -16,6 +16,7 @@ from lpvid.restructure._matching import (
     is_stable,
     largest_gain,
     match_from_starts,
+    response_error,
     weighted_response,
 )
 from lpvid.restructure._method import HinfMatching
@@ -47,10 +48,13 @@ def run_stages(
         candidates.append(jax.vmap(structure.from_search)(best))
     if given is not None:
         candidates.append(given)
-    matched = _match(structure, jnp.concatenate(candidates), target, method.match_steps, stable)
+    starts = jnp.concatenate(candidates)
+    matched = _match(structure, starts, target, method.match_steps, stable)
     # Hits are counted where the search was made: the polished point is one more trial.
     told = _tally(structure, matched, target) if told is None else told
-    parameters, norm, peak = _lowest_norm(structure, matched, target, stable)
+    # An earlier result is a minimum of the norm, which least squares leaves: the best start counts.
+    best = [*matched.value[jnp.argsort(matched.cost)[:2]], _closest(structure, starts, target)]
+    parameters, norm, peak = _lowest_norm(structure, best, target, stable)
     history = [norm]
     for _ in range(method.passes):
         descent = _descend(structure, parameters, target, peak[None], method)
@@ -84,9 +88,8 @@ def run_stages(
     )
 
 
-def _lowest_norm(structure, matched: Solution, target, stable):
-    """The better one, by the norm, of the two best matches: least squares may miss a spike."""
-    best = matched.value[jnp.argsort(matched.cost)[:2]]
+def _lowest_norm(structure, best: list[Array], target, stable):
+    """The best one by the norm: least squares may miss a spike."""
     norms = [error_norm(structure, parameters, target) for parameters in best]
     values = jnp.stack([norm.value for norm in norms])
     if stable:
@@ -94,7 +97,7 @@ def _lowest_norm(structure, matched: Solution, target, stable):
         values = jnp.where(allowed, values, jnp.inf)
     peaks = jnp.stack([norm.frequency for norm in norms])
     winner = jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))
-    return best[winner], values[winner], peaks[winner]
+    return jnp.stack(best)[winner], values[winner], peaks[winner]
 
 
 def _outcome(
@@ -119,6 +122,15 @@ def _outcome(
 @eqx.filter_jit
 def _match(structure, starts, target, max_steps, stable):
     return match_from_starts(structure, starts, target, max_steps, stable)
+
+
+@eqx.filter_jit
+def _closest(structure, starts, target):
+    """The start of the least gain on the grid, within the bounds."""
+    lower, upper = structure.bounds()
+    starts = jnp.clip(starts, lower[None], upper[None])
+    gains = jax.vmap(lambda p: largest_gain(response_error(structure, p, target)))(starts)
+    return starts[jnp.argmin(jnp.where(jnp.isfinite(gains), gains, jnp.inf))]
 
 
 _tally = eqx.filter_jit(tally)

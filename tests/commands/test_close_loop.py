@@ -36,7 +36,7 @@ def engine(monkeypatch):
     # Few dots: pictures are tested elsewhere.
     monkeypatch.setattr(_report, "png_bytes", functools.partial(_report.png_bytes, dpi=10.0))
     monkeypatch.setattr(_close_loop, "structure_named", structure_named)
-    monkeypatch.setattr(loop, "close_the_loop", close_the_loop, raising=False)
+    monkeypatch.setattr(loop, "close_the_loop", close_the_loop)
     return asked
 
 
@@ -69,7 +69,7 @@ def test_verdict_effects_and_errors_are_said_and_written(capsys, tmp_path, table
     assert (base, order) == ("servo", None)
     # The structure is started from what is fitted to, and from nothing else.
     assert fitted.n_samples == pytest.approx(2 / 3 * engine.data.n_samples, abs=1)
-    assert engine.options == {"split": pytest.approx(2 / 3), "progress": False}
+    assert engine.options == {"test": None, "split": pytest.approx(2 / 3), "progress": False}
 
 
 def test_files_are_experiments_and_a_test_file_is_held_out(capsys, tables, engine):
@@ -82,7 +82,6 @@ def test_files_are_experiments_and_a_test_file_is_held_out(capsys, tables, engin
     ((base, fitted, order),) = engine.bases
     assert (base, order) == ("black-box", 3)
     assert fitted is engine.data
-    assert "split" not in engine.options
 
 
 def test_a_saved_model_is_where_it_starts(capsys, tmp_path, tables, engine):

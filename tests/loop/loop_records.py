@@ -14,8 +14,8 @@ from lpvid.loop import (
 )
 
 DT = 0.01
-FRICTION = "coulomb at joint"
-STIFFNESS = "cubic-stiffness at joint"
+FRICTION = "coulomb at force at joint"
+STIFFNESS = "cubic-stiffness at force at joint"
 
 
 def _trajectories(count, friction, stiffness):
@@ -74,7 +74,7 @@ def named(count=600, verdict="named"):
                     EstimatedNumber("level", 0.7034, 0.0061, "N m"),
                     EstimatedNumber("speed", 0.021, np.inf, "rad/s"),
                 ),
-                confusable_with=("dahl at joint", "stribeck at joint"),
+                confusable_with=("dahl at force at joint", "stribeck at force at joint"),
                 gain=912.4,
                 held_out_gain=402.7,
                 p_value=0.0,

@@ -64,7 +64,7 @@ def test_the_json_has_the_agreed_keys(tmp_path):
         "level": {"value": 0.7034, "std": 0.0061, "unit": "N m"},
         "speed": {"value": 0.021, "std": None, "unit": "rad/s"},
     }
-    assert first["confusable_with"] == ["dahl at joint", "stribeck at joint"]
+    assert first["confusable_with"] == ["dahl at force at joint", "stribeck at force at joint"]
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
@@ -132,6 +132,7 @@ def test_estimates_have_as_many_digits_as_their_intervals():
     assert text(-0.00031234, 1e-6) == "-3.123e-04 ± 2.0e-06"
     assert text(1.0, 0.0, "kg") == "1 kg"
     assert text(np.nan, 1.0) == "nan"
+    assert text(0.5, 0.005, "1") == "0.5000 ± 0.0098"
     assert text(5.0, np.inf, "s") == "5 s (undecided)"
 
 

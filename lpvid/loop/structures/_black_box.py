@@ -27,7 +27,9 @@ _AUTOMATIC = 6
 # An order more is worth it from this drop of the mean log squared error on: more where its poles
 # are no resonance, since slow and damped ones also follow friction.
 _WORTH = 2.0
-_WORTH_RESONANCE = 0.3
+_WORTH_RESONANCE = 0.9
+# The second order is any mechanism's.
+_WORTH_SECOND = 0.6
 # Damping ratios of what counts as a resonance; a spurious one may be a little unstable.
 _DAMPING = (-0.05, 0.3)
 # Feedthrough is from this one on, in windows of single samples.
@@ -163,7 +165,8 @@ def _chosen(
         parameters = form.linear.shape[1]
         fitted = np.mean([parameters / (e.number * e.samples * ny / OVERLAP) for e in windows])
         score, resonant = found.score + float(fitted), _resonances(A)
-        each = _WORTH_RESONANCE if size == 2 or resonant > resonances else _WORTH
+        each = _WORTH_RESONANCE if resonant > resonances else _WORTH
+        each = min(each, _WORTH_SECOND) if size == 2 else each
         if order is not None or score < least - each * (waited + 1):
             chosen, least, waited = (form, found.theta), score, 0
             resonances = resonant
@@ -203,7 +206,7 @@ def _refined(
     size = form.linear.shape[1]
     free = (np.full(size, -np.inf), np.full(size, np.inf))
     problem = WindowError(windows, ny=form.ny, bounds=free, matrices=form.matrices)
-    tries, rounds = (1, 2) if thorough else (0, 1)
+    tries, rounds = (1, 2) if thorough else (0, 2)
     guesses = np.array(thetas)
     theta, score = best_start(problem, guesses, tries=tries, rounds=rounds, followed=2)
     return _Found(theta, score, float(problem.scores(theta[None], [0])[0]))
