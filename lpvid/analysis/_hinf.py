@@ -127,7 +127,7 @@ def _norm(A, B, C, D, *, dt: float, tolerance: float, eigensolver: AbstractEigen
     fixed = (jnp.where(finite, fixed[0], still), *(jnp.where(finite, m, 0.0) for m in fixed[1:]))
     continuous, unit = to_normalised_continuous(*fixed, dt=dt)
     form = modal_form(*continuous, eigensolver)
-    stable, boundary = _stability(form.poles, dt)
+    stable, boundary = stability(form.poles, dt)
     boundary = boundary & finite
     usable = ~boundary & finite & jnp.isfinite(jnp.sum(continuous[0]))
     continuous = (
@@ -182,7 +182,7 @@ def _point(omega, unit, dt: float):
     return jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(omega, dtype=bool)
 
 
-def _stability(poles, dt: float):
+def stability(poles, dt: float):
     """Whether all poles are stable, and whether one lies on the boundary (normalised system)."""
     stable = jnp.all(poles.real < 0.0)
     if dt == 0.0:

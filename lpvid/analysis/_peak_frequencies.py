@@ -13,6 +13,7 @@ from lpvid.analysis._hinf import (
     check_system,
     from_normalised,
     largest_peak,
+    stability,
     to_normalised_continuous,
 )
 from lpvid.analysis._modal import (
@@ -31,13 +32,14 @@ def peak_frequencies(
 ) -> tuple[Float[Array, "*batch {count}"], Float[Array, "*batch {count}"]]:
     """Frequencies of the highest local maxima of the largest singular value, highest first.
 
-    Every pole's frequency, the midpoints between them and zero are climbed from; the global maximum
-    is the certified one of `hinf_norm`. Where there are fewer than `count` maxima the highest is
+    Every pole's frequency, its half-power flanks, the midpoints between poles and zero are climbed
+    from; the global maximum is the certified one of `hinf_norm`. Where there are fewer than `count` maxima the highest is
     repeated. Infinite frequency (continuous systems with D) is left out, so a gain that is reached
     only there does not appear; a discrete system's Nyquist frequency is an ordinary one. No
     derivatives: frequencies are for building grids. A system that cannot be diagonalised to working
     precision has its other candidates listed as they are, without the climb. Works under `jit`
-    (with `count` static) and `vmap`. A pole on the stability boundary makes the gains meaningless.
+    (with `count` static) and `vmap`. Where a pole lies on the stability boundary all gains are
+    infinite, as the norm is.
 
     Args:
         system: continuous or discrete model with any leading batch axes.
@@ -85,9 +87,7 @@ def _single(A, B, C, D, *, dt: float, count: int, eigensolver: AbstractEigensolv
     # A difference of two nearly equal modes has a peak on either side of them, none at the top.
     flanks = jnp.abs(jnp.abs(imag) + jnp.where(imag > 0.0, rate, -rate))
     omega = jnp.concatenate([jnp.where(jnp.isfinite(top), top, 0.0)[None], omega, middle, flanks])
-    width = jnp.concatenate(
-        [jnp.zeros(1), width, 0.25 * (ordered[1:] - ordered[:-1]), 0.25 * rate]
-    )
+    width = jnp.concatenate([jnp.zeros(1), width, 0.25 * (ordered[1:] - ordered[:-1]), 0.25 * rate])
     omega, squared = lax.cond(
         trustworthy(form),
         lambda start: refine_peaks(form, start[0], start[1], 12),
@@ -111,4 +111,5 @@ def _single(A, B, C, D, *, dt: float, count: int, eigensolver: AbstractEigensolv
     first = jnp.argsort(repeated, stable=True)
     keep = jnp.where(repeated[first], 0, first)
     keep = jnp.concatenate([keep, jnp.zeros(count, keep.dtype)])[:count]
-    return omega[keep], jnp.sqrt(squared[keep])
+    _, boundary = stability(form.poles, dt)
+    return omega[keep], jnp.where(boundary, jnp.inf, jnp.sqrt(squared[keep]))

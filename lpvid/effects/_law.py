@@ -42,6 +42,7 @@ class Signals(eqx.Module):
         output: y at the port.
         time: s since the record's start.
         history: u at the port, the present sample first (13,).
+        sample: time from one sample of the history to the next, s.
     """
 
     position: Float[Array, ""]
@@ -52,6 +53,7 @@ class Signals(eqx.Module):
     output: Float[Array, ""]
     time: Float[Array, ""]
     history: Float[Array, " lag"]
+    sample: Float[Array, ""]
 
 
 class Size(NamedTuple):
@@ -250,6 +252,7 @@ def at(
     output: ArrayLike = 0.0,
     time: ArrayLike = 0.0,
     history: ArrayLike | None = None,
+    sample: ArrayLike = 1.0,
 ) -> Signals:
     """Signals at one instant, zero unless given: to try a law by hand.
 
@@ -262,6 +265,7 @@ def at(
         output: y at the port.
         time: s.
         history: u at the port, the present sample first (13,); `input` all along by default.
+        sample: s between samples.
 
     Example:
         >>> at(velocity=2.0).velocity
@@ -278,4 +282,5 @@ def at(
         output=jnp.asarray(output, float),
         time=jnp.asarray(time, float),
         history=past,
+        sample=jnp.asarray(sample, float),
     )

@@ -20,8 +20,8 @@ from lpvid.loop._program import (
     Setting,
     Slots,
     Trace,
-    laws_of,
     moments,
+    path_of,
     path_rule,
 )
 
@@ -129,7 +129,6 @@ def slots_of(
         places: at most `SLOTS`.
         schedules: number of schedules.
     """
-    law = np.zeros(SLOTS, int)
     arrays = {
         "input": np.zeros((SLOTS, len(structure.input_names))),
         "force": np.zeros((SLOTS, len(structure.coordinate_names))),
@@ -138,13 +137,11 @@ def slots_of(
     }
     follow = np.zeros((SLOTS, schedules))
     for slot, place in enumerate(places):
-        law[slot] = place.law
         arrays[place.port][slot, place.index] = 1.0
         if place.port == "parameter":
             follow[slot, place.schedule] = 1.0
     return Slots(
-        used=jnp.asarray(len(places)),
-        law=jnp.asarray(law),
+        laws=tuple(place.law for place in places),
         input=jnp.asarray(arrays["input"]),
         force=jnp.asarray(arrays["force"]),
         output=jnp.asarray(arrays["output"]),
@@ -175,7 +172,7 @@ def _signals(matrices: Sampled, weights: Array, u: Array, states: Array):
 def port_signals(
     matrices: Sampled, weights: Array, records: Records, trace: Trace
 ) -> dict[str, dict[str, np.ndarray]]:
-    """What laws can read along a trace: at the step's start, its end, and with the sample seen.
+    """What laws can read along a trace: before a sample is seen, then, and at its end.
 
     Args:
         matrices: at the nodes.
@@ -183,7 +180,7 @@ def port_signals(
         records: inputs and times.
         trace: of the predictor.
     """
-    ends = {"start": trace.before, "end": trace.end, "seen": trace.state}
+    ends = {"before": trace.before, "start": trace.state, "end": trace.end}
     return {
         name: {
             key: np.asarray(value)
@@ -193,13 +190,16 @@ def port_signals(
     }
 
 
-def signals_at(signals: dict[str, np.ndarray], records: Records, place: Place) -> Signals:
+def signals_at(
+    signals: dict[str, np.ndarray], records: Records, place: Place, dt: float
+) -> Signals:
     """The signals that one port's law reads, over time, as NumPy arrays.
 
     Args:
         signals: of all ports.
         records: inputs and times.
         place: the effect's seat.
+        dt: sample time, s.
     """
     count = records.u.shape[0]
     nothing = np.zeros(count)
@@ -218,26 +218,27 @@ def signals_at(signals: dict[str, np.ndarray], records: Records, place: Place) -
         "output": pick("output", "output"),
         "time": np.asarray(records.time),
         "history": history[:, :, place.index] if at_input else np.zeros((count, HISTORY)),
+        "sample": np.full(count, dt),
     }
     return Signals(**{name: jnp.asarray(leaf) for name, leaf in leaves.items()})
 
 
-def scales_at(signals: Signals, seen: Signals, dt: float) -> Scales:
+def scales_at(signals: Signals, before: Signals, dt: float) -> Scales:
     """Sizes of what a law reads at its port.
 
     Args:
         signals: over time.
-        seen: the same with the sample seen: how far it moves them says how noisy they are.
+        before: the same before samples are seen: how far these move them says how noisy they are.
         dt: sample time, s.
     """
     names = ("position", "velocity", "acceleration", "load", "input", "output")
     sizes = {}
     for name in names:
-        values, later = np.asarray(getattr(signals, name)), np.asarray(getattr(seen, name))
+        values, earlier = np.asarray(getattr(signals, name)), np.asarray(getattr(before, name))
         sizes[name] = Size(
             float(np.sqrt(np.mean(values**2))),
             float(np.max(np.abs(values))),
-            float(np.std(later - values)),
+            float(np.std(values - earlier)),
         )
     time = np.asarray(signals.time)
     return Scales(**sizes, dt=dt, duration=float(np.ptp(time)) + dt)
@@ -252,7 +253,11 @@ def _regressors(
     shapes: Float[Array, "candidate shape"],
     remembers: bool,
 ) -> tuple[Array, Array, Array]:
-    evaluate = laws_of(setting.laws)
+    branches = [path_of(one) for one in setting.laws]
+
+    def evaluate(*of):
+        return lax.switch(law, branches, *of)
+
     start, end = signals
     dt = jnp.asarray(setting.dt)
     shares = jnp.asarray(path_rule(_SPOTS)[0])
@@ -265,7 +270,7 @@ def _regressors(
             ahead,
         )
         middle = jax.tree.map(lambda a, b: 0.5 * (a + b), here, ahead)
-        values, following = evaluate(law, path, middle, shares * dt, shape, memory, dt)
+        values, following = evaluate(path, middle, shares * dt, shape, memory, dt)
         level, change = moments(values)
         return following, (level, change, values[0])
 
@@ -308,7 +313,9 @@ def regressors(
         Three arrays (candidate, time, amplitude).
     """
     law = setting.laws[place.law]
-    own = tuple(signals_at(signals[name], records, place) for name in ("start", "end"))
+    # A sensor's effect is part of the prediction, before the sample is seen.
+    begin = "before" if place.port == "output" else "start"
+    own = tuple(signals_at(signals[name], records, place, setting.dt) for name in (begin, "end"))
     found = []
     for begin in range(0, shapes.shape[0], _AT_ONCE):
         part = shapes[begin : begin + _AT_ONCE]

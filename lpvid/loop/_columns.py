@@ -243,10 +243,10 @@ def scales_of(trace: Along, place: Place) -> Scales:
         trace: whose signals set the scales.
         place: where and which law.
     """
-    own, seen = (
-        signals_at(trace.signals[name], trace.records, place) for name in ("start", "seen")
+    own, before = (
+        signals_at(trace.signals[name], trace.records, place, trace.setting.dt) for name in ("start", "before")
     )
-    return scales_at(own, seen, trace.setting.dt)
+    return scales_at(own, before, trace.setting.dt)
 
 
 def grid_of(trace: Along, place: Place) -> np.ndarray:

@@ -1,6 +1,4 @@
-"""The predictor with its effects, one compiled program for every set of effects."""
-
-from collections.abc import Sequence
+"""The predictor with its effects, one compiled program for every set of laws."""
 
 import equinox as eqx
 import jax
@@ -91,11 +89,10 @@ class Records(eqx.Module):
 
 
 class Slots(eqx.Module):
-    """Which effect sits where; arrays, so that another set of effects needs no new compilation.
+    """Which effect sits where; arrays, so that other ports need no new compilation.
 
     Attributes:
-        used: how many of the slots are.
-        law: index of the law (slot,).
+        laws: index of the law of each effect; the program is compiled for each set of laws.
         input: 1 at the input it acts on (slot, nu).
         force: 1 at the coordinate it acts on (slot, coordinate).
         output: 1 at the output it acts on (slot, ny).
@@ -103,8 +100,7 @@ class Slots(eqx.Module):
         schedule: 1 at the schedule that the parameter follows (slot, schedule).
     """
 
-    used: Int[Array, ""]
-    law: Int[Array, " slot"]
+    laws: tuple[int, ...] = eqx.field(static=True)
     input: Float[Array, "slot nu"]
     force: Float[Array, "slot coordinate"]
     output: Float[Array, "slot ny"]
@@ -147,7 +143,7 @@ class Trace(eqx.Module):
         innovations: y − ŷ (time, ny).
         before: state before the sample was seen (time, state).
         state: state with the sample seen (time, state).
-        end: where the state goes from `before` by itself (time, state): the way laws are read on.
+        end: state at the sample's end, the next sample not seen (time, state).
         forces: what the effects added, inputs, then coordinates' directions (time, drive).
         memory: internal states of the effects before the sample (time, slot, memory).
     """
@@ -160,35 +156,30 @@ class Trace(eqx.Module):
     memory: Float[Array, "time slot memory"]
 
 
-def laws_of(laws: Sequence[AbstractLaw]):
-    """One function for all laws, along the path that the signals take over a step.
+def path_of(law: AbstractLaw):
+    """A law along the path that its signals take over a step.
 
-    It takes a law's index, its signals at several fractions of the step (fraction,), those in the
+    The function takes its signals at several fractions of the step (fraction,), those in the
     step's middle, the fractions times the step in s, the shape, the memory, and the step in s; it
     gives the regressors (fraction, amplitude) and the memory at the step's end.
 
     Args:
-        laws: the library.
+        law: of the library.
     """
+    own, spare = len(law.shapes), AMPLITUDES - len(law.amplitudes)
 
-    def one(law: AbstractLaw):
-        own, spare = len(law.shapes), AMPLITUDES - len(law.amplitudes)
+    def evaluate(path: Signals, middle: Signals, after: Array, shape: Array, memory: Array, dt):
+        shape = shape[:own]
 
-        def evaluate(path: Signals, middle: Signals, after: Array, shape: Array, memory: Array, dt):
-            shape = shape[:own]
+        def at(signals, passed):
+            now = law.advance(middle, shape, memory, passed) if law.memory else memory
+            return law.regressors(signals, shape, now)
 
-            def at(signals, passed):
-                now = law.advance(middle, shape, memory, passed) if law.memory else memory
-                return law.regressors(signals, shape, now)
+        values = jax.vmap(at)(path, after)
+        end = law.advance(middle, shape, memory, dt) if law.memory else memory
+        return jnp.concatenate([values, jnp.zeros((values.shape[0], spare))], axis=1), end
 
-            values = jax.vmap(at)(path, after)
-            end = law.advance(middle, shape, memory, dt) if law.memory else memory
-            return jnp.concatenate([values, jnp.zeros((values.shape[0], spare))], axis=1), end
-
-        return evaluate
-
-    branches = [one(law) for law in laws]
-    return lambda index, *of: lax.switch(index, branches, *of)
+    return evaluate
 
 
 def moments(values: Float[Array, "fraction *rest"]) -> tuple[Array, Array]:
@@ -253,9 +244,9 @@ def trace(
 ) -> Trace:
     """Run the predictor over the records.
 
-    Each sample: ŷ = C x + D u with the sensors' effects; exponential steps from x (`SUBSTEPS`) with
-    the effects along the way, a straight line over each step; and Φ L (y − ŷ) added at the end.
-    With a gain of zero it is a simulation.
+    Each sample is taken in `SUBSTEPS` exponential steps with the effects along the way, a straight
+    line over each; the first of them sees the measurement, ŷ = C x + D u with the sensors' effects,
+    and corrects x by L (y − ŷ). With a gain of zero it is a simulation.
 
     Args:
         setting: structure, laws, sample time.
@@ -265,11 +256,11 @@ def trace(
         gain: L at the nodes of κ (node, state, ny).
         injection: added signals, usually zero.
     """
-    evaluate = laws_of(setting.laws)
+    laws = [path_of(setting.laws[law]) for law in slots.laws]
     # Without effects one step is exact.
-    substeps = jnp.where(slots.used > 0, SUBSTEPS, 1)
-    fine = setting.dt / substeps.astype(float)
-    matrices, node_weights = node_matrices(setting, slots, unknowns, records, fine)
+    substeps = SUBSTEPS if slots.laws else 1
+    fine = setting.dt / substeps
+    matrices, node_weights = node_matrices(setting, slots, unknowns, records, jnp.asarray(fine))
     nu, ny = records.u.shape[1], records.y.shape[1]
     coordinates, directions = slots.force.shape[1], unknowns.amplitude.shape[2]
 
@@ -303,20 +294,20 @@ def trace(
                 output=ideal @ slots.output[slot],
                 time=times,
                 history=still[:, None] * (history @ slots.input[slot])[None],
+                sample=setting.dt * still,
             )
 
-        def one(slot, so_far):
+        def one(slot, evaluate, so_far):
             drive, output, next_memory = so_far
             here = at_slot(slot, path, time + after)
-            centre = at_slot(slot, middle, time + 0.5 * fine[None])
+            centre = at_slot(slot, middle, time + jnp.full(1, 0.5 * fine))
             values, following = evaluate(
-                slots.law[slot],
                 here,
                 jax.tree.map(lambda leaf: leaf[0], centre),
                 after,
                 unknowns.shape[slot],
                 memory[slot],
-                fine,
+                jnp.asarray(fine),
             )
             total = values @ unknowns.amplitude[slot]
             pushed = (slots.force[slot][None, :, None] * total[:, None, :]).reshape(total.shape[0], -1)
@@ -328,65 +319,62 @@ def trace(
             )
 
         still = jnp.zeros((FRACTIONS.size, nu + coordinates * directions))
-        start = (still, jnp.zeros(ny), memory)
-        return lax.fori_loop(0, slots.used, one, start)
+        total = (still, jnp.zeros(ny), memory)
+        for slot, evaluate in enumerate(laws):
+            total = one(slot, evaluate, total)
+        return total
 
-    def step(carry, sample):
+    def step(carry, fraction):
         x, memory, drive = carry
-        u, y, history, time, weight, kappa_weight, first, which, added_x, added_y = sample
+        u, y, history, time, weight, kappa_weight, first, which, sees, ends, added = fraction
         M = _at(matrices, weight)
         L = jnp.tensordot(kappa_weight, gain, axes=1)
         x = jnp.where(first > 0.0, unknowns.start[which], x)
         memory = jnp.where(first > 0.0, records.memory[which], memory)
         drive = jnp.where(first > 0.0, 0.0, drive)
-        held = jnp.concatenate([u, jnp.zeros(coordinates * directions)])
+        held = jnp.concatenate([u, idle[nu:]])
+        # Laws are read on the way that the model takes by itself, with the last forces.
+        free = M.transition @ x + M.drive @ held
+        along, sensed, following = contributions(M, x, free + M.drive @ drive, memory, u, history, time)
+        level, change = moments(along)
+        error = sees * (y - (M.C @ x + M.D @ (u + level[:nu]) + sensed + added.output))
+        correction = L @ error
+        moved = free + M.drive @ level + M.ramp @ change + M.transition @ correction
+        # Added at the end, so that a sensitivity sees it as one more force over the sample.
+        moved = moved + ends * added.state
+        return (moved, following, level + change), (error, x, x + correction, moved, level, memory)
 
-        def fraction(number, state):
-            # Laws are read on the way that the model takes by itself, with the last forces; a
-            # correction by the innovation would only be another predictor's gain.
-            x, memory, drive, said, first_drive, total = state
-            free = M.transition @ x
-            end = free + M.drive @ (held + drive)
-            begun = time + fine * jnp.asarray(number, float)
-            along, sensed, following = contributions(M, x, end, memory, u, history, begun)
-            level, change = moments(along)
-            moved = free + M.drive @ (held + level) + M.ramp @ change
-            said = jnp.where(number == 0, sensed, said)
-            first_drive = jnp.where(number == 0, level, first_drive)
-            return moved, following, level + change, said, first_drive, total + level
+    # Every sample is a few fractions, of which the first sees the measurement.
+    def spread(array):
+        return jnp.repeat(array, substeps, axis=0)
 
-        moved, following, drive, sensed, pushed, total = lax.fori_loop(
-            0,
-            substeps,
-            fraction,
-            (x, memory, drive, jnp.zeros(ny), jnp.zeros_like(drive), jnp.zeros_like(drive)),
-        )
-        error = y - (M.C @ x + M.D @ (u + pushed[:nu]) + sensed + added_y)
-        correction = lax.fori_loop(
-            0, substeps, lambda _, moving: M.transition @ moving, L @ error
-        )
-        # Added here, so that a sensitivity sees it as one more force over the sample.
-        ahead = moved + correction + added_x
-        mean = total / substeps.astype(float)
-        out = (error, x, x + L @ error, moved, mean, memory)
-        return (ahead, following, drive), out
-
-    samples = (
-        records.u,
-        records.y,
-        records.history,
-        records.time,
-        node_weights,
-        records.weights,
-        records.first,
-        records.record,
-        injection.state,
-        injection.output,
+    place = jnp.tile(jnp.arange(float(substeps)), records.u.shape[0])
+    fractions = (
+        *map(spread, (records.u, records.y, records.history)),
+        spread(records.time) + fine * place,
+        *map(spread, (node_weights, records.weights)),
+        jnp.where(place == 0.0, spread(records.first), 0.0),
+        spread(records.record),
+        jnp.where(place == 0.0, 1.0, 0.0),
+        jnp.where(place == substeps - 1.0, 1.0, 0.0),
+        jax.tree.map(spread, injection),
     )
     idle = jnp.zeros(nu + coordinates * directions)
     start = (unknowns.start[0], jnp.zeros((SLOTS, MEMORY)), idle)
-    _, out = lax.scan(step, start, samples)
-    return Trace(*out)
+    _, out = lax.scan(step, start, fractions)
+    error, before, seen, moved, level, memory = out
+
+    def at_samples(array, offset=0):
+        return array[offset::substeps]
+
+    return Trace(
+        innovations=at_samples(error),
+        before=at_samples(before),
+        state=at_samples(seen),
+        end=at_samples(moved, substeps - 1),
+        forces=jnp.mean(level.reshape(-1, substeps, level.shape[1]), axis=1),
+        memory=at_samples(memory),
+    )
 
 
 def nothing_injected(records: Records, states: int) -> Injection:

@@ -190,6 +190,8 @@ def with_effect(fitted: Fitted, records: Records, entry: Ranked) -> Fitted:
     """
     law, place = fitted.setting.laws[entry.trial.place.law], entry.trial.place
     unknowns = _seated(fitted.unknowns, len(fitted.places), entry, law.whole)
+    if law.whole and law.shapes:
+        unknowns = _best_start(fitted, records, entry, unknowns)
     model = fitted
     for _ in range(2):
         trace = along(model.setting, records, model.slots, model.unknowns, model.gain)
@@ -208,6 +210,40 @@ def with_effect(fitted: Fitted, records: Records, entry: Ranked) -> Fitted:
         # The better predictor sees its signals with less noise, which widens the bounds.
         unknowns = model.unknowns
     return model
+
+
+def _best_start(
+    fitted: Fitted, records: Records, entry: Ranked, unknowns: Unknowns
+) -> Unknowns:
+    """Of several shapes of a law that replaces a signal, the one a few steps go furthest from.
+
+    The model's parameters have made up for it as well as they could, so its likelihood has minima
+    of its own: an amplitude of 2 at a delay of one sample means two samples or more.
+    """
+    slot, place = len(fitted.places), entry.trial.place
+    trace = along(fitted.setting, records, fitted.slots, fitted.unknowns, fitted.gain)
+    scales = (*fitted.scales, scales_of(trace, place))
+    lower, upper = fitted.setting.laws[place.law].bounds(scales[-1])
+    tried = []
+    for factor in (0.5, 1.0, 2.0, 4.0, 8.0):
+        shape = np.array(unknowns.shape)
+        own = entry.trial.shape * factor
+        shape[slot, : own.size] = np.clip(own, lower, upper)
+        start = eqx.tree_at(lambda tree: tree.shape, unknowns, jnp.asarray(shape))
+        tried.append(
+            fit(
+                fitted.setting,
+                records,
+                (*fitted.places, place),
+                scales,
+                start,
+                fitted.noise,
+                ratio=fitted.ratio,
+                cycles=1,
+                steps=4,
+            )
+        )
+    return max(tried, key=lambda one: one.searched.log_likelihood).unknowns
 
 
 def _cramped(model: Fitted, law: AbstractLaw) -> bool:
@@ -278,21 +314,43 @@ def choose(
         tried.append((entry, refitted, likelihood_on(refitted, errors)))
     if not tried:
         return None
-    tried.sort(key=lambda one: -float(np.sum(one[2])) if np.all(np.isfinite(one[2])) else np.inf)
-    entry, refitted, likelihood = tried[0]
+    tried = [one for one in tried if np.all(np.isfinite(one[2]))]
+    if not tried:
+        return None
+    entry, refitted, likelihood = _simplest(tried)
     gain, p_value = better(before, likelihood)
     if p_value > LEVEL:
         return None
     confusable = [
         other.trial.place
-        for other, model, rival in tried[1:]
-        if better(rival, likelihood)[1] > LEVEL
+        for other, model, rival in tried
+        if other is not entry
+        and better(rival, likelihood)[1] > LEVEL
         and model.searched.log_likelihood
-        > refitted.searched.log_likelihood - scipy.stats.chi2.isf(LEVEL, 1) / 2.0
+        > refitted.searched.log_likelihood - 0.5 * scipy.stats.chi2.isf(LEVEL, 1)
     ]
     confusable += _alike(ranking, entry, [one[0] for one in tried])
     promised = family_wise(entry.scored.p_value, ranking.tests)
     return Chosen(refitted, entry, tuple(dict.fromkeys(confusable)), gain, promised)
+
+
+def _simplest(
+    tried: list[tuple[Ranked, Fitted, np.ndarray]],
+) -> tuple[Ranked, Fitted, np.ndarray]:
+    """Of those that held-out data cannot tell from the best, the one the others' records prefer.
+
+    Preferred by likelihood on the estimation data less the penalty for its numbers.
+    """
+    best = max(tried, key=lambda one: float(np.sum(one[2])))
+    level = [one for one in tried if one is best or better(one[2], best[2])[1] > LEVEL]
+
+    def worth(one):
+        entry, model, _ = one
+        numbers = entry.columns.shape[2] + entry.trial.shape.size
+        samples = model.searched.errors.shape[0]
+        return model.searched.log_likelihood - 0.5 * numbers * np.log(samples)
+
+    return max(level, key=worth)
 
 
 def _alike(ranking: Ranking, entry: Ranked, tried: Sequence[Ranked]) -> list[Place]:

@@ -14,14 +14,12 @@ from lpvid.loop._gain import gains
 from lpvid.loop._program import AMPLITUDES, SHAPES, SLOTS, Records, Setting, Slots, Unknowns
 from lpvid.loop._search import Searched, log_likelihood, run, search
 
-RATIOS = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1e4)
-"""Diffusions tried, relative to the outputs' noise; 0 is a simulation."""
+RATIOS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1e4)
+"""Diffusions tried, relative to the outputs' noise. None at all would let errors of the parameters
+add up without end on other data."""
 
 _WORTH = 0.5
 """Least gain in log-likelihood for which diffusion and parameters take another turn."""
-
-_SLOW = 1e-2
-"""The slow gain's share of the diffusion: it shows what a fast one follows and so hides."""
 
 
 class Fitted(NamedTuple):
@@ -209,9 +207,7 @@ def with_starts(fitted: Fitted, records: Records, gain: Array | None = None) -> 
         records: as many as it was fitted to.
         gain: L; the model's own if `None`.
     """
-    unknowns = eqx.tree_at(
-        lambda tree: tree.start, fitted.unknowns, jnp.zeros_like(fitted.unknowns.start)
-    )
+    unknowns = eqx.tree_at(lambda tree: tree.start, fitted.unknowns, _rough_starts(fitted, records))
     places = start_places(unknowns)
     free = np.full(places.size, np.inf)
     found = search(
@@ -223,23 +219,14 @@ def with_starts(fitted: Fitted, records: Records, gain: Array | None = None) -> 
         places,
         -free,
         free,
-        steps=3,
+        steps=5,
         tolerance=0.1,
     )
     return found.unknowns
 
 
-def slow_gain(fitted: Fitted, records: Records) -> Array:
-    """A gain of a hundredth of the fitted diffusion.
-
-    Args:
-        fitted: the model.
-        records: the nodes of κ.
-    """
-    return _gains(
-        fitted.setting,
-        records,
-        fitted.unknowns.theta,
-        jnp.asarray(fitted.noise),
-        jnp.asarray(_SLOW * fitted.ratio),
-    )
+def _rough_starts(fitted: Fitted, records: Records) -> Array:
+    """Initial states (record, state): the outputs as measured, the rest at rest."""
+    C = fitted.setting.structure.ports(fitted.unknowns.theta, records.kappa_nodes[0]).C
+    first = np.asarray(records.y)[np.asarray(records.first) > 0.0]
+    return jnp.asarray(first @ np.linalg.pinv(np.asarray(C)).T)

@@ -71,7 +71,7 @@ def _one(bench: Bench, fitted: Fitted, slot: int, place: Place) -> VirtualForce:
         residual = moved @ (weight * column) / max(float(column @ (weight * column)), 1e-300)
     family = bench.setting.laws[place.law].family
     reads = {"input": "input", "output": "output"}.get(place.port, _READS.get(family, "velocity"))
-    signals = signals_at(own.signals["start"], records, place)
+    signals = signals_at(own.signals["start"], records, place, full.setting.dt)
     regressor = np.asarray(getattr(signals, reads))
     unit, named = _named(structure, place, reads)
     return VirtualForce(

@@ -109,7 +109,8 @@ def certify(
     first = jnp.broadcast_to(model.vectors[None, :, :, 0], (turns, count, model.error.shape[2]))
     begun = (first, jnp.zeros(n), jnp.zeros(count))
     _, shortest, multipliers = jax.lax.fori_loop(0, turns, solve, begun)
-    distance = jnp.linalg.norm(shortest)
+    # Where the numbers overflow nothing is known.
+    distance = jnp.nan_to_num(jnp.linalg.norm(shortest), nan=jnp.inf)
     exact = peaks.norm <= peaks.floor
     upper, lower = bounds.upper - point, point - bounds.lower
     reach = _AT_BOUND * jnp.linalg.norm(shape, axis=1)

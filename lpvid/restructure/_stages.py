@@ -1,5 +1,7 @@
 """The stages of one restructuring, each compiled on its own."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,6 +25,9 @@ from lpvid.restructure._method import HinfMatching
 from lpvid.restructure._minima import tally
 from lpvid.restructure._restructured import Restructured
 from lpvid.restructure._surrogate import refine_smooth
+
+# Two ways to one norm agree to this share.
+_SLACK = 1e-6
 
 
 def run_stages(
@@ -69,8 +74,16 @@ def run_stages(
     certificate = None
     if method.bundle_steps > 0:
         descent, certificate = _bundle(structure, parameters, target, method, stable)
-        parameters = descent.value
-        history.append(descent.peaks.norm)
+        reached = error_norm(structure, descent.value, target).value
+        # Peaks mean nothing where numbers overflow; a point that the norm refuses is left.
+        sound = (reached <= norm * (1.0 + _SLACK)) | ~jnp.isfinite(norm)
+        parameters = jnp.where(sound, descent.value, parameters)
+        history.append(jnp.where(sound, reached, norm))
+        certificate = replace(
+            certificate,
+            distance=jnp.where(sound, certificate.distance, jnp.inf),
+            certified=certificate.certified & sound,
+        )
     final = error_norm(structure, parameters, target)
     forbidden = ~is_stable(structure, parameters) if stable else jnp.asarray(False)
     return Restructured(
@@ -108,7 +121,7 @@ def _outcome(
     `forbidden` says that a stable model was asked for and none was found.
     """
     size = largest_gain(weighted_response(target))
-    poor = (final.value >= 0.999 * size) & (size > 0.0)
+    poor = (final.value >= 0.999 * size) & (size > 0.0) & jnp.isfinite(final.value)
     status = final.status
     if certificate is not None:
         told = (status != Status.successful) | certificate.certified

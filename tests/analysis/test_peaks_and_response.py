@@ -31,6 +31,29 @@ def test_peaks_are_the_local_maxima_of_a_dense_grid(dt):
         np.testing.assert_allclose(height[0], norm.value, rtol=1e-9)
 
 
+@pytest.mark.slow
+def test_both_peaks_beside_nearly_equal_modes_are_found():
+    def mode(frequency, damping, B, C):
+        A = [[0.0, frequency], [-frequency, -2.0 * damping * frequency]]
+        return StateSpace(A, B, C)
+
+    grid = np.linspace(8.0, 12.0, 4001)
+    # Those of 300 with two peaks, seven of which no climb from the poles or between them reaches.
+    for seed in (33, 78, 102, 105, 115, 145, 171, 271):
+        rng = np.random.default_rng(seed)
+        B, C = rng.normal(size=(2, 1)), rng.normal(size=(2, 2))
+        change = rng.normal(size=2) * [0.003, 0.1]
+        other = (m * (1.0 + 0.05 * rng.normal(size=m.shape)) for m in (B, C))
+        system = mode(10.0, 0.02, B, C) - mode(10 + 10 * change[0], 0.02 + 0.02 * change[1], *other)
+        omega, _ = peaks(system, 4)
+        gain = np.asarray(singular_values(system, grid))[:, 0]
+        tops = 1 + np.flatnonzero((gain[1:-1] > gain[:-2]) & (gain[1:-1] > gain[2:]))
+        tops = tops[gain[tops] > 0.5 * gain.max()]
+        assert len(tops) == 2
+        for top in tops:
+            assert np.min(np.abs(omega - grid[top])) < 5e-3
+
+
 def test_padding_repeats_the_highest():
     system = StateSpace(np.diag([-1.0, -3.0]), [[1.0], [0.0]], [[2.0, 0.0]])
     omega, gain = peaks(system, 5)

@@ -50,8 +50,8 @@ def test_sensor_lag_of_an_output_straight_between_samples():
 def test_delay_is_the_mean_of_the_delayed_staircase():
     one = law("input-delay")
     history = SIGNAL[:HISTORY]
-    memory = one.advance(at(), jnp.zeros(1), jnp.zeros(2), jnp.asarray(DT))
-    run = jax.jit(lambda d: one.regressors(at(input=history[0], history=history), d, memory)[0])
+    signals = at(input=history[0], history=history, sample=DT)
+    run = jax.jit(lambda d: one.regressors(signals, d, jnp.zeros(2))[0])
     inside = DT * (np.arange(1000) + 0.5) / 1000
     for samples in (0.0, 0.25, 1.0, 3.605, 12.0):
         # History's entry i was sent i samples ago and held for one.

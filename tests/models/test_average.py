@@ -192,3 +192,14 @@ def test_faults_are_named():
         ResponseAverage(weights=np.ones((3, 2, 2)))
     with pytest.raises(ValueError, match=r"weights: shape \(2, 2, 2\)"):
         average([system], ResponseAverage(omega=[1.0, 2.0], weights=np.ones((3, 2, 2))))
+
+
+@pytest.mark.slow
+def test_a_failed_response_average_is_said():
+    # Between two resonances the mean's phase turns backwards: one mode fits it unstably.
+    modes = [
+        StateSpace([[0.0, w], [-w, -0.02 * w]], [[0.0], [1.0]], [[w, 0.0]]) for w in (1.0, 1.2)
+    ]
+    with pytest.warns(UserWarning, match="the aligned average is returned"):
+        mean = average(modes, ResponseAverage(omega=np.linspace(1.05, 1.15, 9)))
+    np.testing.assert_allclose(mean.A, average(modes).A)

@@ -177,6 +177,32 @@ def test_the_certificate_holds_for_several_channels():
     assert shortest(subgradients(black_box, best)) <= 2.0 * BUNDLE_ONLY.tolerance
 
 
+def turned(angle):
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+@pytest.mark.slow
+def test_the_certificate_holds_where_singular_values_are_equal():
+    # One gain for two channels that want 1 and 3, in turned axes: at 2 both errors are 1.
+    left, right = turned(0.4), turned(1.1)
+    structure = FunctionStructure(
+        lambda p: (-p[1] * jnp.eye(2), p[0] * p[1] * jnp.asarray(right), jnp.asarray(left)),
+        nominal=[1.0, 1.0],
+        names=("gain", "rate"),
+    )
+    black_box = StateSpace(-np.eye(2), np.diag([1.0, 3.0]) @ right, left)
+    options = {"starts": 0, "method": BUNDLE_ONLY}
+    best = restructure(black_box, structure, initial=[2.3, 1.2], **options)
+    np.testing.assert_allclose(best.error_norm, 1.0, rtol=1e-6)
+    np.testing.assert_allclose(best.parameters[0], 2.0, rtol=1e-5)
+    # Neither singular vector alone is short: the norm of each falls with the gain.
+    assert best.certificate.certified and is_successful(best.status)
+    elsewhere = restructure(
+        black_box, structure, initial=[2.3, 1.2], fixed={"gain": 2.3}, **options
+    )
+    np.testing.assert_allclose(elsewhere.error_norm, 1.3, rtol=1e-6)
+
+
 BENCHMARK = Path(__file__).resolve().parents[2] / "benchmarks" / "restructure.py"
 
 

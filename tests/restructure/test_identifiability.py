@@ -7,8 +7,9 @@ import pytest
 
 from lpvid.mechanics import reference_two_link_arm, two_link_arm_structure
 from lpvid.models import FunctionStructure
-from lpvid.restructure import identifiability
+from lpvid.restructure import HinfMatching, identifiability, restructure
 
+MATCH_ONLY = HinfMatching(passes=0, bundle_steps=0)
 ARM = reference_two_link_arm()
 ARM_STRUCTURE = two_link_arm_structure(lengths=(0.35, 0.30))
 
@@ -54,6 +55,41 @@ def test_a_sum_is_named():
     assert seen.rank == 2 and seen.names == ("k3", "k4")
     assert seen.describe() == ("k3 and k4 enter only as k3 + k4: fix one of them, or tie them.",)
     np.testing.assert_allclose(np.abs(seen.directions[0, 2:4]), seen.directions[0, 2:4].max())
+
+
+def test_what_is_fixed_or_tied_is_not_asked_about():
+    fixed = identifiability(PRODUCT, POINT, fixed=("ghost", "k1"))
+    assert fixed.rank == 2 and fixed.names == () and fixed.singular_values.shape == (2,)
+    # Tied, k1 = k2 enters as its square, and the ghost goes along with the mass.
+    tied = identifiability(PRODUCT, [2.0, 2.0, 1.0, 4.0, 0.5, 0.5], tied=["k?", ("mass", "ghost")])
+    assert tied.rank == 1 and tied.names == ()
+    alone = identifiability(PRODUCT, [2.0, 2.0, 1.0, 4.0, 0.5, 0.0], tied=[("k1", "k2")])
+    assert alone.names == ("ghost",)
+    with pytest.raises(ValueError, match="no parameter is called 'spring'"):
+        identifiability(PRODUCT, POINT, fixed=("spring",))
+
+
+@pytest.mark.slow
+def test_a_result_knows_what_it_was_given():
+    lag = FunctionStructure(
+        lambda p: (-p[:1, None] / p[1], p[2:, None] * jnp.eye(1), jnp.eye(1)),
+        nominal=[2.0, 3.0, 1.0],
+        names=("rate", "length", "gain"),
+    )
+    black_box = lag.matrices(jnp.array([4.0, 2.0, 1.5]))
+    options = {"starts": 0, "initial": [3.0, 2.0, 1.0], "method": MATCH_ONLY}
+    assert restructure(black_box, lag, **options).unidentifiable == ("rate", "length")
+    known = restructure(black_box, lag, fixed={"length": 2.0}, **options)
+    assert known.fixed == ("length",) and known.unidentifiable == ()
+    equal = restructure(black_box, lag, tied=[("rate", "length")], **options)
+    assert equal.tied == (("rate", "length"),)
+    # Tied they drop out altogether, and are named together.
+    assert equal.unidentifiable == ("rate", "length")
+    # At high frequency the response is gain / jω: the rate is not told there.
+    far = restructure(black_box, lag, omega=[1e7, 2e7], fixed={"length": 2.0}, **options)
+    assert far.omega.shape == (2,)
+    seen = identifiability(lag, far.parameters, omega=far.omega, fixed=far.fixed)
+    assert seen.singular_values.shape == (2,)
 
 
 @pytest.mark.slow
