@@ -8,10 +8,13 @@ __version__ = "0.1.0"
 
 from lpvid import analysis as analysis
 from lpvid import data as data
+from lpvid import effects as effects
+from lpvid import loop as loop
 from lpvid import mechanics as mechanics
 from lpvid import models as models
 from lpvid import montecarlo as montecarlo
 from lpvid import plot as plot
+from lpvid import report as report
 from lpvid import study as study
 from lpvid._results import Status as Status
 from lpvid.analysis import HinfNorm as HinfNorm
@@ -78,6 +81,8 @@ from lpvid.io import load as load
 from lpvid.io import load_mat as load_mat
 from lpvid.io import save as save
 from lpvid.io import save_mat as save_mat
+from lpvid.loop import Loop as Loop
+from lpvid.loop import close_the_loop as close_the_loop
 from lpvid.models import AbstractStructure as AbstractStructure
 from lpvid.models import AlignedAverage as AlignedAverage
 from lpvid.models import FreeStructure as FreeStructure

@@ -47,9 +47,7 @@ def ladder(fitted: Fitted, records: Records, horizon: int) -> np.ndarray:
         records: held-out data.
         horizon: samples.
     """
-    trace = run(
-        fitted.setting, records, fitted.slots, with_starts(fitted, records), fitted.gain
-    )
+    trace = run(fitted.setting, records, fitted.slots, with_starts(fitted, records), fitted.gain)
     count = int(np.sum(np.asarray(records.counts)))
     record = np.asarray(records.record)[:count]
     # The predictor has settled after a horizon; a segment stays within its record.

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from lpvid.effects import HISTORY, MEMORY, AbstractLaw, Scales, Signals, Size
 from lpvid.loop._discretise import Sampled
+from lpvid.loop._path import moments, path_of, path_rule
 from lpvid.loop._ported import AbstractPortedStructure
 from lpvid.loop._program import (
     SHAPES,
@@ -20,9 +21,6 @@ from lpvid.loop._program import (
     Setting,
     Slots,
     Trace,
-    moments,
-    path_of,
-    path_rule,
 )
 
 _ANGLES = ("", "rad")
@@ -35,20 +33,19 @@ _AT_ONCE = 6
 """Shapes of one law worked out at once."""
 
 
-
 class Place(NamedTuple):
     """One effect's seat: its law, the kind of port and which one, and what a parameter follows.
 
     Attributes:
         law: index into the library.
         port: "input", "force", "output" or "parameter".
-        index: of the input, coordinate, output or parameter.
+        where: of the input, coordinate, output or parameter.
         schedule: index of the schedule a parameter follows.
     """
 
     law: int
     port: str
-    index: int
+    where: int
     schedule: int = 0
 
 
@@ -73,12 +70,12 @@ def port_name(structure: AbstractPortedStructure, place: Place, schedules: Seque
         schedules: names of the schedules.
     """
     if place.port == "input":
-        return f"input {structure.input_names[place.index]}"
+        return f"input {structure.input_names[place.where]}"
     if place.port == "force":
-        return f"force at {structure.coordinate_names[place.index]}"
+        return f"force at {structure.coordinate_names[place.where]}"
     if place.port == "output":
-        return f"output {structure.output_names[place.index]}"
-    return f"{structure.parameter_names[place.index]} over {schedules[place.schedule]}"
+        return f"output {structure.output_names[place.where]}"
+    return f"{structure.parameter_names[place.where]} over {schedules[place.schedule]}"
 
 
 def places_of(
@@ -119,9 +116,7 @@ def places_of(
     return found
 
 
-def slots_of(
-    structure: AbstractPortedStructure, places: Sequence[Place], schedules: int
-) -> Slots:
+def slots_of(structure: AbstractPortedStructure, places: Sequence[Place], schedules: int) -> Slots:
     """Arrays that say which effect sits where.
 
     Args:
@@ -137,7 +132,7 @@ def slots_of(
     }
     follow = np.zeros((SLOTS, schedules))
     for slot, place in enumerate(places):
-        arrays[place.port][slot, place.index] = 1.0
+        arrays[place.port][slot, place.where] = 1.0
         if place.port == "parameter":
             follow[slot, place.schedule] = 1.0
     return Slots(
@@ -205,7 +200,7 @@ def signals_at(
     nothing = np.zeros(count)
 
     def pick(name, port):
-        return signals[name][:, place.index] if place.port == port else nothing
+        return signals[name][:, place.where] if place.port == port else nothing
 
     at_input = place.port == "input"
     u, history = np.asarray(records.u), np.asarray(records.history)
@@ -214,10 +209,10 @@ def signals_at(
         "velocity": pick("velocity", "force"),
         "acceleration": pick("acceleration", "force"),
         "load": pick("load", "force"),
-        "input": u[:, place.index] if at_input else nothing,
+        "input": u[:, place.where] if at_input else nothing,
         "output": pick("output", "output"),
         "time": np.asarray(records.time),
-        "history": history[:, :, place.index] if at_input else np.zeros((count, HISTORY)),
+        "history": history[:, :, place.where] if at_input else np.zeros((count, HISTORY)),
         "sample": np.full(count, dt),
     }
     return Signals(**{name: jnp.asarray(leaf) for name, leaf in leaves.items()})
@@ -315,7 +310,10 @@ def regressors(
     law = setting.laws[place.law]
     # A sensor's effect is part of the prediction, before the sample is seen.
     begin = "before" if place.port == "output" else "start"
-    own = tuple(signals_at(signals[name], records, place, setting.dt) for name in (begin, "end"))
+    own = (
+        signals_at(signals[begin], records, place, setting.dt),
+        signals_at(signals["end"], records, place, setting.dt),
+    )
     found = []
     for begin in range(0, shapes.shape[0], _AT_ONCE):
         part = shapes[begin : begin + _AT_ONCE]

@@ -15,6 +15,9 @@ from lpvid.loop._discretise import Sampled, sampled_at
 from lpvid.loop._program import Injection, Records, Setting, Slots, Unknowns, node_matrices
 from lpvid.loop._search import COLUMNS, injected, run
 
+Signal = tuple[np.ndarray, np.ndarray]
+"""What is added to the state (time, state) and to the output (time, ny)."""
+
 
 class Along(NamedTuple):
     """A trace, and what candidates read along it.
@@ -103,10 +106,10 @@ def _parameter_matrices(setting: Setting, theta: Float[Array, " parameter"], nod
     return jax.vmap(lambda direction: jax.jvp(at, (theta,), (direction,))[1])(jnp.diag(theta))
 
 
-def _varied(trace: Along, place: Place, varying: Sampled) -> Injection:
+def _varied(trace: Along, place: Place, varying: Sampled) -> Signal:
     """What a parameter that follows a schedule adds to state and output, at first order."""
     records = trace.records
-    own = jax.tree.map(lambda leaf: np.asarray(leaf[place.index]), varying)
+    own = jax.tree.map(lambda leaf: np.asarray(leaf[place.where]), varying)
     follow = np.asarray(records.schedules[:, place.schedule])[:, None]
     weights, nu = np.asarray(records.weights), records.u.shape[1]
     seen, before = (np.asarray(states) for states in trace.states)
@@ -114,10 +117,10 @@ def _varied(trace: Along, place: Place, varying: Sampled) -> Injection:
     moved = moved + _over_nodes(weights, own.drive[:, :, :nu], np.asarray(trace.inputs))
     said = _over_nodes(weights, own.C, before)
     said = said + _over_nodes(weights, own.D, np.asarray(records.u))
-    return Injection(moved * follow, said * follow)
+    return moved * follow, said * follow
 
 
-def _driven(trace: Along, columns: Sequence[int], level, change, sensed) -> list[Injection]:
+def _driven(trace: Along, columns: Sequence[int], level, change, sensed) -> list[Signal]:
     """Injections of signals (time, amplitude) into columns of the drive."""
     weights = np.asarray(trace.weights)
     nu = trace.records.u.shape[1]
@@ -131,23 +134,23 @@ def _driven(trace: Along, columns: Sequence[int], level, change, sensed) -> list
             if column < nu:
                 through = np.asarray(trace.matrices.D)[:, :, pick]
                 output = _over_nodes(weights, through, sensed[:, number, None])
-            found.append(Injection(state, output))
+            found.append((state, output))
     return found
 
 
-def _sensed(trace: Along, output: int, sensed: np.ndarray) -> list[Injection]:
+def _sensed(trace: Along, output: int, sensed: np.ndarray) -> list[Signal]:
     """Injections of signals (time, amplitude) into an output."""
     found = []
     for number in range(sensed.shape[1]):
         signal = np.zeros(trace.records.y.shape)
         signal[:, output] = sensed[:, number]
-        found.append(Injection(np.zeros_like(np.asarray(trace.states[0])), signal))
+        found.append((np.zeros_like(np.asarray(trace.states[0])), signal))
     return found
 
 
 def _injections(
     trace: Along, place: Place, shapes: np.ndarray, varying: Sampled
-) -> list[list[Injection]]:
+) -> list[list[Signal]]:
     """For each shape, one injection for each amplitude and direction."""
     if place.port == "parameter":
         return [[_varied(trace, place, varying)]]
@@ -155,36 +158,31 @@ def _injections(
         *regressors(trace.setting, place, shapes, trace.signals, trace.records), strict=True
     )
     if place.port == "output":
-        return [_sensed(trace, place.index, sensed) for _, _, sensed in every]
+        return [_sensed(trace, place.where, sensed) for _, _, sensed in every]
     nu, directions = trace.records.u.shape[1], trace.unknowns.amplitude.shape[2]
-    columns = [place.index]
+    columns = [place.where]
     if place.port == "force":
-        columns = [nu + place.index * directions + number for number in range(directions)]
+        columns = [nu + place.where * directions + number for number in range(directions)]
     return [_driven(trace, columns, *one) for one in every]
 
 
-def _sensitivities(trace: Along, every: list[Injection]) -> np.ndarray:
+def _sensitivities(trace: Along, every: list[Signal]) -> np.ndarray:
     """Derivatives of the innovations by injections (time, ny, column), padding left out."""
     batch, wanted = COLUMNS, len(every)
     every = every + [every[-1]] * (-wanted % batch)
     parts = []
     for begin in range(0, len(every), batch):
-        stacked = jax.tree.map(
-            lambda *leaf: jnp.asarray(np.stack(leaf)), *every[begin : begin + batch]
-        )
+        states, outputs = zip(*every[begin : begin + batch], strict=True)
+        stacked = Injection(jnp.asarray(np.stack(states)), jnp.asarray(np.stack(outputs)))
         parts.append(
-            injected(
-                trace.setting, trace.records, trace.slots, trace.unknowns, trace.gain, stacked
-            )
+            injected(trace.setting, trace.records, trace.slots, trace.unknowns, trace.gain, stacked)
         )
     count = int(np.sum(np.asarray(trace.records.counts)))
     columns = np.concatenate([np.asarray(part) for part in parts])
     return np.moveaxis(columns, 0, 2)[:count, :, :wanted]
 
 
-def trial_columns(
-    trace: Along, places: Sequence[Place]
-) -> Iterator[tuple[Trial, np.ndarray]]:
+def trial_columns(trace: Along, places: Sequence[Place]) -> Iterator[tuple[Trial, np.ndarray]]:
     """Each place with each shape of its law's grid, and the innovations' derivatives.
 
     Args:
@@ -194,10 +192,8 @@ def trial_columns(
     Yields:
         Trials with derivatives by their amplitudes (time, ny, column).
     """
-    varying = _parameter_matrices(
-        trace.setting, trace.unknowns.theta, trace.records.kappa_nodes
-    )
-    waiting: list[tuple[Trial, list[Injection]]] = []
+    varying = _parameter_matrices(trace.setting, trace.unknowns.theta, trace.records.kappa_nodes)
+    waiting: list[tuple[Trial, list[Signal]]] = []
 
     def flush():
         columns = _sensitivities(trace, [one for _, group in waiting for one in group])
@@ -244,7 +240,8 @@ def scales_of(trace: Along, place: Place) -> Scales:
         place: where and which law.
     """
     own, before = (
-        signals_at(trace.signals[name], trace.records, place, trace.setting.dt) for name in ("start", "before")
+        signals_at(trace.signals[name], trace.records, place, trace.setting.dt)
+        for name in ("start", "before")
     )
     return scales_at(own, before, trace.setting.dt)
 

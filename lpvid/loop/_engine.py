@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
@@ -107,16 +108,12 @@ def _base(bench: Bench) -> Fitted:
     structure = bench.setting.structure
     train = bench.data[0]
     theta = np.asarray(structure.start(train), float)
-    ports = structure.ports(theta, bench.train.kappa_nodes[0])
-    unknowns = empty_unknowns(
-        theta, ports.A.shape[0], len(train.lengths), ports.force.shape[2]
-    )
+    ports = structure.ports(jnp.asarray(theta), bench.train.kappa_nodes[0])
+    unknowns = empty_unknowns(theta, ports.A.shape[0], len(train.lengths), ports.force.shape[2])
     noise = rough_noise(np.asarray(train.y))
     fitted = fit(bench.setting, bench.train, (), (), unknowns, noise)
     noise = np.maximum(noise_in(fitted.searched.errors), 1e-3 * noise)
-    return fit(
-        bench.setting, bench.train, (), (), fitted.unknowns, noise, ratio=fitted.ratio
-    )
+    return fit(bench.setting, bench.train, (), (), fitted.unknowns, noise, ratio=fitted.ratio)
 
 
 def _rounds(
@@ -141,9 +138,7 @@ def _rounds(
     return fitted, chosen, rankings
 
 
-def _questioned(
-    bench: Bench, fitted: Fitted, chosen: list[Chosen]
-) -> tuple[Fitted, list[Chosen]]:
+def _questioned(bench: Bench, fitted: Fitted, chosen: list[Chosen]) -> tuple[Fitted, list[Chosen]]:
     """Take out earlier effects that held-out data no longer ask for."""
     slot = 0
     while slot < len(chosen) - 1:

@@ -96,9 +96,7 @@ def rank(fitted: Fitted, records: Records, schedules: Sequence[str]) -> Ranking:
     least = min((entry.scored.p_value for entry in entries), default=1.0)
     general = _general(trace, test)
     tests = sum(tests_at(trace, place, count) for place, count in tried.items())
-    return Ranking(
-        tuple(entries), test, tests, family_wise(least, max(tests, 1)), general
-    )
+    return Ranking(tuple(entries), test, tests, family_wise(least, max(tests, 1)), general)
 
 
 def _general(trace, test: ScoreTest) -> float:
@@ -141,7 +139,11 @@ def _seated(unknowns: Unknowns, slot: int, entry: Ranked, whole: bool) -> Unknow
         values = entry.scored.amplitude.reshape(-1, directions)
         amplitude[slot, : values.shape[0], :directions] = values
     shape[slot, : entry.trial.shape.size] = entry.trial.shape
-    return eqx.tree_at(lambda tree: (tree.amplitude, tree.shape), unknowns, (jnp.asarray(amplitude), jnp.asarray(shape)))
+    return eqx.tree_at(
+        lambda tree: (tree.amplitude, tree.shape),
+        unknowns,
+        (jnp.asarray(amplitude), jnp.asarray(shape)),
+    )
 
 
 def held_out_errors(fitted: Fitted, records: Records) -> np.ndarray:
@@ -212,9 +214,7 @@ def with_effect(fitted: Fitted, records: Records, entry: Ranked) -> Fitted:
     return model
 
 
-def _best_start(
-    fitted: Fitted, records: Records, entry: Ranked, unknowns: Unknowns
-) -> Unknowns:
+def _best_start(fitted: Fitted, records: Records, entry: Ranked, unknowns: Unknowns) -> Unknowns:
     """Of several shapes of a law that replaces a signal, the one a few steps go furthest from.
 
     The model's parameters have made up for it as well as they could, so its likelihood has minima
@@ -284,9 +284,7 @@ def without(fitted: Fitted, records: Records, slot: int) -> Fitted:
     )
 
 
-def choose(
-    fitted: Fitted, ranking: Ranking, records: Records, held_out: Records
-) -> Chosen | None:
+def choose(fitted: Fitted, ranking: Ranking, records: Records, held_out: Records) -> Chosen | None:
     """Refit the best few and take the one that held-out data prefer, if they prefer any.
 
     Args:

@@ -34,7 +34,9 @@ def _least_squares(gram: np.ndarray, product: np.ndarray) -> np.ndarray:
     """Minimal solution of gram x = product, both scaled to a unit diagonal first."""
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = np.linalg.eigh(gram / scale[:, None] / scale[None, :])
-    inverse = np.where(values > _RANK * max(values[-1], 1e-300), 1.0 / np.where(values > 0, values, 1), 0.0)
+    inverse = np.where(
+        values > _RANK * max(values[-1], 1e-300), 1.0 / np.where(values > 0, values, 1), 0.0
+    )
     return (vectors @ (inverse * (vectors.T @ (product / scale)))) / scale
 
 

@@ -123,9 +123,7 @@ def sensitivities(
     """
     size = ravel_pytree(unknowns)[0].size
     length, states = records.u.shape[0], unknowns.start.shape[1]
-    still = Injection(
-        jnp.zeros((COLUMNS, length, states)), jnp.zeros((COLUMNS, *records.y.shape))
-    )
+    still = Injection(jnp.zeros((COLUMNS, length, states)), jnp.zeros((COLUMNS, *records.y.shape)))
     count = int(np.sum(np.asarray(records.counts)))
     parts, errors = [], None
     for begin in range(0, places.size, COLUMNS):
@@ -238,30 +236,26 @@ def search(
         # What sits at a bound and would leave it does not take part in this step.
         free = ~(((point <= lower) & (slope > 0.0)) | ((point >= upper) & (slope < 0.0)))
         move = np.zeros(places.size)
-        while True:
+        trial, got = best, None
+        while damping <= _MOST:
             move[free] = _step(gram[np.ix_(free, free)], slope[free], damping)
             trial = best.copy()
             trial[places] = np.clip(point + move, lower, upper)
             taken = trial[places] - point
             promised = -(slope @ taken + 0.5 * taken @ gram @ taken)
             if promised < tolerance:
-                converged = True
                 break
-            got = evaluate(trial)
-            if got[2] > reached:
-                damping = max(damping * _LESS, 1e-9)
+            found = evaluate(trial)
+            if found[2] > reached:
+                damping, got = max(damping * _LESS, 1e-9), found
                 break
             damping *= _MORE
-            if damping > _MOST:
-                converged = True
-                break
-        if converged:
+        if got is None:
+            converged = True
             break
         gained = got[2] - reached
         best, (errors, columns, reached) = trial, got
         if gained < tolerance:
             converged = True
             break
-    return Searched(
-        unravel(jnp.asarray(best)), errors, columns, places, reached, converged
-    )
+    return Searched(unravel(jnp.asarray(best)), errors, columns, places, reached, converged)

@@ -61,14 +61,10 @@ def summarise(
     if horizon is None:
         horizon = int(np.clip(min(held_out.lengths) // 20, 5, 200))
     errors = {name: held_out_errors(model, bench.held_out) for name, model in _both(base, fitted)}
-    before, ladder_before, run_before = errors_of(
-        base, bench.held_out, errors["before"], horizon
-    )
+    before, ladder_before, run_before = errors_of(base, bench.held_out, errors["before"], horizon)
     after, ladder_after, run_after = before, ladder_before, run_before
     if chosen:
-        after, ladder_after, run_after = errors_of(
-            fitted, bench.held_out, errors["after"], horizon
-        )
+        after, ladder_after, run_after = errors_of(fitted, bench.held_out, errors["after"], horizon)
     y = np.asarray(held_out.y)
     floor = np.minimum(noise_in(errors["after"]), noise_in(y - run_after))
     floor = np.minimum(floor, after.one_step)
@@ -162,9 +158,7 @@ def _parameters(
 ) -> tuple[EstimatedNumber, ...]:
     structure, theta = bench.setting.structure, np.asarray(fitted.unknowns.theta)
     spread = standard_errors(covariance)[: theta.size]
-    rows = zip(
-        structure.parameter_names, theta, spread, structure.parameter_units, strict=True
-    )
+    rows = zip(structure.parameter_names, theta, spread, structure.parameter_units, strict=True)
     return tuple(
         EstimatedNumber(name, float(value), float(std), unit) for name, value, std, unit in rows
     )
@@ -173,13 +167,11 @@ def _parameters(
 def _units(bench: Bench, place: Place) -> Units:
     structure = bench.setting.structure
     if place.port == "force":
-        return Units(
-            structure.force_units[place.index], structure.coordinate_units[place.index]
-        )
+        return Units(structure.force_units[place.where], structure.coordinate_units[place.where])
     if place.port == "input":
-        return Units(structure.input_units[place.index])
+        return Units(structure.input_units[place.where])
     if place.port == "output":
-        return Units(structure.output_units[place.index])
+        return Units(structure.output_units[place.where])
     return Units("")
 
 
@@ -188,9 +180,7 @@ def _effect(
 ) -> FoundEffect:
     place = found.entry.trial.place
     law, units = bench.setting.laws[place.law], _units(bench, place)
-    where, _, _ = free_unknowns(
-        bench.setting, fitted.places, fitted.scales, fitted.unknowns
-    )
+    where, _, _ = free_unknowns(bench.setting, fitted.places, fitted.scales, fitted.unknowns)
     spread = np.full(int(where.max()) + 1, np.nan)
     spread[where] = standard_errors(covariance)
     directions = fitted.unknowns.amplitude.shape[2]
@@ -244,15 +234,11 @@ def _classical(errors: np.ndarray, data) -> dict[str, float]:
     try:
         linear = residual_tests(jnp.asarray(errors), data.u, lengths=data.lengths)
         centred = (np.asarray(data.u) - np.mean(np.asarray(data.u), axis=0)) ** 2
-        squares = residual_tests(
-            jnp.asarray(errors**2), jnp.asarray(centred), lengths=data.lengths
-        )
+        squares = residual_tests(jnp.asarray(errors**2), jnp.asarray(centred), lengths=data.lengths)
     except ValueError:
         # Too short or constant residuals: the tests have nothing to say.
         return found
     found["whiteness"] = float(linear.joint_whiteness_p)
     found["cross-correlation with the input"] = float(np.min(np.asarray(linear.dynamics_p)))
-    found["squared residual against squared input"] = float(
-        np.min(np.asarray(squares.dynamics_p))
-    )
+    found["squared residual against squared input"] = float(np.min(np.asarray(squares.dynamics_p)))
     return found

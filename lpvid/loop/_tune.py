@@ -11,7 +11,8 @@ from jaxtyping import Array
 from lpvid.effects import Scales
 from lpvid.loop._candidates import Place, slots_of
 from lpvid.loop._gain import gains
-from lpvid.loop._program import AMPLITUDES, SHAPES, SLOTS, Records, Setting, Slots, Unknowns
+from lpvid.loop._path import AMPLITUDES
+from lpvid.loop._program import SHAPES, SLOTS, Records, Setting, Slots, Unknowns
 from lpvid.loop._search import Searched, log_likelihood, run, search
 
 RATIOS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1e4)
@@ -185,17 +186,21 @@ def fit(
             scored.append(log_likelihood(errors))
         return ratios[int(np.argmax(scored))]
 
-    found, before = None, -np.inf
+    best: tuple[Searched, Array, float] | None = None
     for _ in range(cycles):
         gain = gain_of(unknowns, ratio)
         found = search(setting, records, slots, unknowns, gain, where, lower, upper, steps=steps)
-        unknowns, following = found.unknowns, choose(found.unknowns, ratio)
-        if following == ratio or found.log_likelihood < before + _WORTH:
+        reached = -np.inf if best is None else best[0].log_likelihood
+        if best is None or found.log_likelihood > reached:
+            best = found, gain, ratio
+        following = choose(found.unknowns, ratio)
+        if following == ratio or found.log_likelihood < reached + _WORTH:
             break
-        ratio, before = following, found.log_likelihood
-    assert found is not None
+        unknowns, ratio = found.unknowns, following
+    assert best is not None
+    found, gain, ratio = best
     return Fitted(
-        setting, tuple(places), tuple(scales), slots, unknowns, gain, ratio, noise, found
+        setting, tuple(places), tuple(scales), slots, found.unknowns, gain, ratio, noise, found
     )
 
 

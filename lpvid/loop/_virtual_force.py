@@ -62,7 +62,7 @@ def _one(bench: Bench, fitted: Fitted, slot: int, place: Place) -> VirtualForce:
     trace = run(full.setting, records, full.slots, lacking, gain)
     errors = np.asarray(trace.innovations)
     if place.port == "output":
-        residual = errors[:, place.index]
+        residual = errors[:, place.where]
     else:
         # The force that would have moved the state as the measurements say it moved.
         moved = np.asarray(trace.state - trace.before)
@@ -95,13 +95,13 @@ def _contribution(own: Along, fitted: Fitted, slot: int, place: Place) -> np.nda
 
 def _column(own: Along, place: Place) -> np.ndarray:
     nu, directions = own.records.u.shape[1], own.unknowns.amplitude.shape[2]
-    column = place.index if place.port == "input" else nu + place.index * directions
+    column = place.where if place.port == "input" else nu + place.where * directions
     return np.mean(own.drive[:, :, column], axis=0)
 
 
 def _named(structure, place: Place, reads: str) -> tuple[str, str]:
     """Unit of what is added, and what it is drawn against, with its unit."""
-    index = place.index
+    index = place.where
     if place.port == "input":
         unit, what = structure.input_units[index], f"input {structure.input_names[index]}"
         own = unit

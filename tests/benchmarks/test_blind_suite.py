@@ -23,8 +23,8 @@ def _module(name):
         sys.path.remove(str(ROOT))
 
 
-suite, laws, plants, generator, simulator = (
-    _module(name) for name in ("", "._laws", "._plants", "._generate", "._simulate")
+suite, laws, plants, drawing, generator, simulator = (
+    _module(name) for name in ("", "._laws", "._plants", "._effects", "._generate", "._simulate")
 )
 SAMPLES = 150
 
@@ -125,10 +125,10 @@ def test_every_effect_changes_the_response():
         plant = plants.PLANTS[structure]
         moving = float(plant.scheduled)
         blank = simulator.simulate(plant, runs_of(plant, [[]], moving=moving, kappa=0.5))
-        sizes = generator._sizes(plant, blank, 0)
+        sizes = drawing.sizes_of(plant, blank, 0)
         motion = runs_of(plant, [[]]).motions[0]
         rng = np.random.default_rng(1)
-        names = [*every, *generator.OUTSIDE, "scheduling", "parameter-drift"]
+        names = [*every, *drawing.OUTSIDE, "scheduling", "parameter-drift"]
         if structure == "two-link-arm":
             names = ["coulomb", "cubic-stiffness", "scheduling", "parameter-drift", "saturation"]
         effects = []
@@ -137,7 +137,7 @@ def test_every_effect_changes_the_response():
             there = plant
             if not plant.level_outputs:
                 there = dataclasses.replace(plant, level_outputs=(0, 1))
-            effects.append(generator.draw_effect(name, there, motion, sizes, rng))
+            effects.append(drawing.draw_effect(name, there, motion, sizes, rng))
         runs = runs_of(plant, [[effect] for effect in effects], moving=moving, kappa=0.5)
         signals = simulator.simulate(plant, runs)
         change = np.sqrt(np.mean((signals.y - blank.y) ** 2, axis=(1, 2)))
