@@ -33,13 +33,13 @@ def peak_frequencies(
     """Frequencies of the highest local maxima of the largest singular value, highest first.
 
     Every pole's frequency, its half-power flanks, the midpoints between poles and zero are climbed
-    from; the global maximum is the certified one of `hinf_norm`. Where there are fewer than `count` maxima the highest is
-    repeated. Infinite frequency (continuous systems with D) is left out, so a gain that is reached
-    only there does not appear; a discrete system's Nyquist frequency is an ordinary one. No
-    derivatives: frequencies are for building grids. A system that cannot be diagonalised to working
-    precision has its other candidates listed as they are, without the climb. Works under `jit`
-    (with `count` static) and `vmap`. Where a pole lies on the stability boundary all gains are
-    infinite, as the norm is.
+    from; the global maximum is the certified one of `hinf_norm`. Where there are fewer than `count`
+    maxima the highest is repeated. Infinite frequency (continuous systems with D) is left out, so a
+    gain that is reached only there does not appear; a discrete system's Nyquist frequency is an
+    ordinary one. No derivatives: frequencies are for building grids. A system that cannot be
+    diagonalised to working precision has its other candidates listed as they are, without the
+    climb. Works under `jit` (with `count` static) and `vmap`. Where a pole lies on the stability
+    boundary all gains are infinite, as the norm is.
 
     Args:
         system: continuous or discrete model with any leading batch axes.

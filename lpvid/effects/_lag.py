@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from lpvid.effects._law import AbstractLaw, Amplitude, Scales, Shape, Signals
 from lpvid.effects._ranges import inside, span
-from lpvid.effects._smooth import LEAST_WIDTH, mean_decay
+from lpvid.effects._smooth import LEAST_WIDTH
 
 
 def _range(scales: Scales) -> tuple[float, float]:
@@ -74,15 +74,14 @@ class ActuatorLag(AbstractLaw):
 class SensorLag(AbstractLaw):
     """y → z, ż = (y − z)/τ: adds z − y.
 
-    y taken to run straight between samples gives z⁺ = e z + φ y + ψ y⁺ exactly, e = e^{−h/τ},
-    ψ = 1 − m, φ = m − e, m = (1 − e) τ/h. The memory holds e z + φ y and m, so that it starts
-    settled.
+    Advanced by the output in the step's middle, held over it: z⁺ = y + (z − y) e^{−h/τ}. It starts
+    settled, which the second number of the memory is for. (A form exact for straight outputs would
+    take the jumps that an observer's corrections make for motion.)
 
     Seen as: gain that rolls off, with the phase of it, at one sensor. Confused with an actuator's
     lag and an input delay.
 
-    Source: Franklin, Powell and Workman, Digital Control of Dynamic Systems (1998), section 4.3,
-    first-order hold.
+    Source: Franklin, Powell and Workman, Digital Control of Dynamic Systems (1998), section 4.3.
 
     Example:
         >>> law, tau, rest = SensorLag(), jnp.array([0.1]), jnp.zeros(2)
@@ -112,11 +111,10 @@ class SensorLag(AbstractLaw):
         memory: Float[Array, " memory"],
         dt: Float[Array, ""],
     ) -> Float[Array, " memory"]:
-        """The part of the next z that is known by now."""
-        x = dt / jnp.maximum(shape[0], LEAST_WIDTH)
-        decay, mean = jnp.exp(-x), mean_decay(x)
-        z = signals.output + memory[0] - memory[1] * signals.output
-        return memory.at[:2].set(jnp.stack([decay * z + (mean - decay) * signals.output, mean]))
+        """z at the step's end."""
+        decay = jnp.exp(-dt / jnp.maximum(shape[0], LEAST_WIDTH))
+        behind = memory[0] - memory[1] * signals.output
+        return memory.at[:2].set(jnp.stack([signals.output + behind * decay, jnp.ones(())]))
 
     def grid(self, scales: Scales) -> np.ndarray:
         """Four time constants."""

@@ -243,7 +243,7 @@ def scales_at(signals: Signals, before: Signals, dt: float) -> Scales:
 def _regressors(
     setting: Setting,
     law: Int[Array, ""],
-    signals: tuple[Signals, Signals],
+    signals: tuple[Signals, Signals, Signals],
     first: Float[Array, " time"],
     shapes: Float[Array, "candidate shape"],
     remembers: bool,
@@ -253,33 +253,39 @@ def _regressors(
     def evaluate(*of):
         return lax.switch(law, branches, *of)
 
-    start, end = signals
+    start, end, before = signals
     dt = jnp.asarray(setting.dt)
     shares = jnp.asarray(path_rule(_SPOTS)[0])
 
-    def step(shape, memory, here, there):
+    def step(shape, memory, here, there, earlier):
         ahead = eqx.tree_at(lambda s: (s.time, s.history), there, (here.time + dt, here.history))
+        # Last, what a sensor says before the sample has corrected the state.
         path = jax.tree.map(
-            lambda a, b: (1.0 - _column(shares, a)) * a[None] + _column(shares, a) * b[None],
+            lambda a, b, c: jnp.concatenate(
+                [(1.0 - _column(shares, a)) * a[None] + _column(shares, a) * b[None], c[None]]
+            ),
             here,
             ahead,
+            earlier,
         )
         middle = jax.tree.map(lambda a, b: 0.5 * (a + b), here, ahead)
-        values, following = evaluate(path, middle, shares * dt, shape, memory, dt)
+        after = jnp.append(shares * dt, 0.0)
+        values, following = evaluate(path, middle, after, shape, memory, dt)
+        sensed, values = values[-1], values[:-1]
         level, change = moments(values)
-        return following, (level, change, values[0])
+        return following, (level, change, sensed)
 
     def along(shape):
         empty = jnp.zeros(MEMORY)
         if not remembers:
-            return jax.vmap(lambda a, b: step(shape, empty, a, b)[1])(start, end)
+            return jax.vmap(lambda a, b, c: step(shape, empty, a, b, c)[1])(start, end, before)
 
         def scanned(memory, sample):
-            here, there, begins = sample
+            here, there, earlier, begins = sample
             memory = jnp.where(begins > 0.0, empty, memory)
-            return step(shape, memory, here, there)
+            return step(shape, memory, here, there, earlier)
 
-        return lax.scan(scanned, empty, (start, end, first))[1]
+        return lax.scan(scanned, empty, (start, end, before, first))[1]
 
     return jax.vmap(along)(shapes)
 
@@ -308,11 +314,10 @@ def regressors(
         Three arrays (candidate, time, amplitude).
     """
     law = setting.laws[place.law]
-    # A sensor's effect is part of the prediction, before the sample is seen.
-    begin = "before" if place.port == "output" else "start"
     own = (
-        signals_at(signals[begin], records, place, setting.dt),
+        signals_at(signals["start"], records, place, setting.dt),
         signals_at(signals["end"], records, place, setting.dt),
+        signals_at(signals["before"], records, place, setting.dt),
     )
     found = []
     for begin in range(0, shapes.shape[0], _AT_ONCE):

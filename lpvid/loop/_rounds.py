@@ -21,7 +21,7 @@ from lpvid.loop._verdict import LEVEL
 _ALIKE = 0.95
 """Cosine between projected sensitivities from which two effects are taken for one another."""
 
-_REFITTED = 3
+_REFITTED, _ATTEMPTS = 3, 6
 _HOPEFUL = 0.3
 """Share of the best gain from which a candidate, its shape once free, could still win."""
 
@@ -302,8 +302,12 @@ def choose(fitted: Fitted, ranking: Ranking, records: Records, held_out: Records
         return None
     before = likelihood_on(fitted, held_out_errors(fitted, held_out))
     tried: list[tuple[Ranked, Fitted, np.ndarray]] = []
-    hopeful = [e for e in significant if e.scored.gain >= _HOPEFUL * significant[0].scored.gain]
-    for entry in hopeful[:_REFITTED]:
+    for entry in significant[:_ATTEMPTS]:
+        # Judged by the best that kept its promise: one that did not must not shut out the rest.
+        if tried and entry.scored.gain < _HOPEFUL * tried[0][0].scored.gain:
+            continue
+        if len(tried) == _REFITTED:
+            break
         refitted = with_effect(fitted, records, entry)
         realised = refitted.searched.log_likelihood - fitted.searched.log_likelihood
         if realised < _REALISED * min(entry.scored.gain, 50.0):

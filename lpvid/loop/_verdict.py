@@ -53,7 +53,7 @@ def decide(evidence: Evidence) -> tuple[str, str]:
     Args:
         evidence: what it rests on.
     """
-    left = evidence.p_value_left < LEVEL and evidence.near > NEAR
+    left = evidence.p_value_left < LEVEL and not evidence.near <= NEAR
     if not evidence.named:
         if evidence.p_value >= LEVEL:
             return "nothing to add", (

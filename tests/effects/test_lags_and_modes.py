@@ -40,10 +40,10 @@ def test_actuator_lag_of_a_held_input():
     assert_allclose(got, expected, rtol=1e-10)
 
 
-def test_sensor_lag_of_an_output_straight_between_samples():
+def test_sensor_lag_of_an_output_held_over_the_step():
     got = _lagged("sensor-lag", "output")
     system = ([[-1 / 0.07]], [[1 / 0.07]], [[1.0]], [[0.0]])
-    _, expected, _ = lsim(system, SIGNAL, TIME, X0=[SIGNAL[0]], interp=True)
+    _, expected, _ = lsim(system, SIGNAL, TIME, X0=[SIGNAL[0]], interp=False)
     assert_allclose(got, expected, rtol=1e-10)
 
 

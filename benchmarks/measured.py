@@ -1,0 +1,400 @@
+"""Close the loop on measured records: what is found, and the errors on data that took no part.
+
+The records are not in the project; their folder is in LPVID_DATA (default ../shared/data). Effects
+are sought in the estimation part alone, which `close_the_loop` splits once more for its decisions;
+the scored part is read by the scorer only. No setting was chosen on it.
+
+    python -m benchmarks.measured [--data FOLDER] [--only RECORD ...]
+"""
+
+import os
+
+# One BLAS thread, before anything loads a BLAS.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.interpolate
+import scipy.io
+import scipy.signal
+from tqdm import tqdm
+
+from lpvid.data import IOData
+from lpvid.effects import LIBRARY, at, law
+from lpvid.loop import AbstractPortedStructure, Loop, close_the_loop
+from lpvid.loop._assess import free_run
+from lpvid.loop._candidates import places_of, port_name, slots_of
+from lpvid.loop._program import Setting
+from lpvid.loop._records import records_of, schedule_names, scheduling_nodes
+from lpvid.loop._search import run, search
+from lpvid.loop._tune import Fitted, empty_unknowns
+from lpvid.loop.structures import BlackBox, PortedMassSpringDamper, Servo
+from lpvid.report import text_table
+
+
+class Row(NamedTuple):
+    """One figure of the table."""
+
+    record: str
+    metric: str
+    before: float
+    after: float
+    published: float | None
+    goal: float | None
+
+
+class Outcome(NamedTuple):
+    """What one record came to."""
+
+    loop: Loop
+    rows: tuple[Row, ...]
+    remark: str
+
+
+def data_folder(given: str | None = None) -> Path:
+    return Path(given or os.environ.get("LPVID_DATA", "../shared/data"))
+
+
+def held(u: np.ndarray, y: np.ndarray, factor: int) -> tuple[np.ndarray, np.ndarray]:
+    """Every so-manyeth output, and the mean of the held inputs in between.
+
+    The library holds an input over its sample. A record thinned behind a low-pass filter is half a
+    new sample late for that, which looks like a lag; the mean over the coming samples is not.
+    """
+    steps = len(u) // factor
+    return u[: steps * factor].reshape(steps, factor).mean(axis=1), y[: steps * factor : factor]
+
+
+def model_of(structure: AbstractPortedStructure, loop: Loop, data: IOData) -> Fitted:
+    """The model with its effects as the library's predictor takes it, without a gain."""
+    schedules = schedule_names(data)
+    every = places_of(structure, LIBRARY, schedules)
+    named = {(LIBRARY[p.law].name, port_name(structure, p, schedules)): p for p in every}
+    places = [named[effect.name, effect.port] for effect in loop.effects]
+    theta = np.array([number.value for number in loop.parameters])
+    ports = structure.ports(jnp.asarray(theta), jnp.zeros(0))
+    states, directions = ports.A.shape[0], ports.force.shape[2]
+    unknowns = empty_unknowns(theta, states, len(data.lengths), directions)
+    amplitude, shape = np.array(unknowns.amplitude), np.array(unknowns.shape)
+    for slot, (effect, place) in enumerate(zip(loop.effects, places, strict=True)):
+        own, along = LIBRARY[place.law], directions if place.port == "force" else 1
+        values = [number.value for number in effect.parameters]
+        count = 0 if own.whole else len(own.amplitudes) * along
+        amplitude[slot, 0, 0] = 1.0
+        if count:
+            amplitude[slot, : len(own.amplitudes), :along] = np.reshape(values[:count], (-1, along))
+        shape[slot, : len(own.shapes)] = values[count:]
+    unknowns = type(unknowns)(
+        unknowns.theta, jnp.asarray(amplitude), jnp.asarray(shape), unknowns.start
+    )
+    varying = any(place.port == "parameter" for place in places)
+    setting = Setting(structure, LIBRARY, data.dt, varying)
+    gain = jnp.zeros((1, states, data.ny))
+    slots = slots_of(structure, places, len(schedules))
+    nothing = {"scales": (), "ratio": 0.0, "noise": np.ones(data.ny), "searched": None}
+    return Fitted(setting, tuple(places), slots=slots, unknowns=unknowns, gain=gain, **nothing)
+
+
+def simulated(structure: AbstractPortedStructure, loop: Loop, data: IOData) -> np.ndarray:
+    """Simulation (time, ny) of other records, only their initial states fitted."""
+    return free_run(model_of(structure, loop, data), _records(data))
+
+
+def windowed(
+    structure: AbstractPortedStructure, loop: Loop, data: IOData, starts: np.ndarray
+) -> np.ndarray:
+    """Simulation of records from given states (record, state)."""
+    model = model_of(structure, loop, data)
+    unknowns = model.unknowns
+    unknowns = type(unknowns)(
+        unknowns.theta, unknowns.amplitude, unknowns.shape, jnp.asarray(starts)
+    )
+    out = run(model.setting, _records(data), model.slots, unknowns, model.gain)
+    return np.asarray(data.y) - np.asarray(out.innovations)
+
+
+def _records(data: IOData):
+    return records_of(data, scheduling_nodes(data), data.dt * max(data.lengths), 0.0)
+
+
+def both(structure: AbstractPortedStructure, data: IOData, **options) -> tuple[Loop, Loop]:
+    """The linear model alone, and what close_the_loop makes of it."""
+    return close_the_loop(structure, data, laws=()), close_the_loop(structure, data, **options)
+
+
+def rms(error: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(error**2)))
+
+
+# --- EMPS ------------------------------------------------------------------------------------------
+
+EMPS_FILTER_HZ = (60.0, 10.0)
+"""Of the position before it is differentiated, and of both sides of the force balance; of 20 to
+100 Hz and 5 to 40 Hz what leaves the published model the least error on the first file."""
+
+EMPS_THINNED = 10
+
+
+def emps_file(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Drive force N and position m."""
+    file = scipy.io.loadmat(folder / "emps" / name)
+    force = file["gtau"].ravel() * file["vir"].ravel()
+    return force[20:].astype(float), file["qm"].ravel()[20:].astype(float)
+
+
+def emps_data(force: Sequence[np.ndarray], position: Sequence[np.ndarray], dt: float) -> IOData:
+    return IOData(
+        u=list(force),
+        y=list(position),
+        dt=dt,
+        names={"u": "force", "y": "carriage"},
+        units={"u": "N", "y": "m"},
+    )
+
+
+def _low_passed(signal: np.ndarray, frequency: float) -> np.ndarray:
+    return scipy.signal.filtfilt(*scipy.signal.butter(4, frequency / 500.0), signal)
+
+
+def emps_motion(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity and acceleration, without delay."""
+    velocity = np.gradient(_low_passed(position, EMPS_FILTER_HZ[0]), 1e-3)
+    return velocity, np.gradient(velocity, 1e-3)
+
+
+def emps_force_error(loop: Loop, force: np.ndarray, position: np.ndarray) -> float:
+    """Relative force error of the inverse model in percent."""
+    velocity, acceleration = emps_motion(position)
+    inertia, viscous = (number.value for number in loop.parameters)
+    asked = inertia * acceleration + viscous * velocity
+    signals = at(
+        position=position,
+        velocity=velocity,
+        acceleration=acceleration,
+        input=force,
+        time=1e-3 * np.arange(len(force)),
+    )
+    for effect in loop.effects:
+        own = law(effect.name)
+        if own.memory or own.whole or "output" in effect.port:
+            raise ValueError(f"{effect.name}: no inverse model is written for it.")
+        values = [number.value for number in effect.parameters]
+        count = len(own.amplitudes)
+        terms = own.regressors(signals, jnp.asarray(values[count:]), jnp.zeros(2))
+        asked = asked - np.asarray(jnp.asarray(values[:count]) @ terms)
+    measured, modelled = (_low_passed(one, EMPS_FILTER_HZ[1])[20:-20] for one in (force, asked))
+    return 100.0 * float(np.linalg.norm(modelled - measured) / np.linalg.norm(measured))
+
+
+def emps_position_error(
+    structure: AbstractPortedStructure, loop: Loop, force: np.ndarray, position: np.ndarray
+) -> float:
+    """RMS position error in mm over windows of 1 s, each from the measured state."""
+    velocity, _ = emps_motion(position)
+    begins = np.arange(0, len(position) - 1000, 1000)
+    cut = [slice(begin, begin + 1000) for begin in begins]
+    data = emps_data([force[one] for one in cut], [position[one] for one in cut], 1e-3)
+    starts = np.stack([position[begins], velocity[begins]], axis=1)
+    return 1e3 * rms(np.asarray(data.y) - windowed(structure, loop, data, starts))
+
+
+def emps(folder: Path) -> Outcome:
+    """Thinned to 10 ms for the search: motion is slower than 5 Hz; errors are at 1 ms."""
+    force, position = emps_file(folder, "DATA_EMPS.mat")
+    thin = held(force, position, EMPS_THINNED)
+    data = emps_data([thin[0]], [thin[1]], 1e-3 * EMPS_THINNED)
+    structure = Servo(data)
+    linear, loop = both(structure, data)
+    rows = []
+    for name, file, published, goal in (
+        ("own file", "DATA_EMPS.mat", 3.11, None),
+        ("second file", "DATA_EMPS_PULSES.mat", 5.98, 2.6),
+    ):
+        record = emps_file(folder, file)
+        errors = [emps_force_error(one, *record) for one in (linear, loop)]
+        rows.append(Row("EMPS", f"force, {name} %", *errors, published, goal))
+    errors = [emps_position_error(structure, one, *record) for one in (linear, loop)]
+    rows.append(Row("EMPS", "position over 1 s, mm", *errors, 1.74, 0.46))
+    return Outcome(loop, tuple(rows), "")
+
+
+# --- Silverbox -------------------------------------------------------------------------------------
+
+SILVERBOX_SEARCHED = 4000
+"""Samples of the estimation part that the search takes: a sixteenth of it."""
+
+SILVERBOX_SKIPPED = 50
+SILVERBOX_MULTISINE = (40650, 127400)
+
+
+def silverbox_part(folder: Path, first: int, last: int) -> IOData:
+    """Samples of the file in mV, less the offsets of the estimation part.
+
+    The input is band-limited, not held: the mean of a cubic spline over each coming sample stands
+    for it, since the library holds an input over its sample.
+    """
+    file = folder / "silverbox" / "SNLS80mV.csv"
+    both = np.loadtxt(file, delimiter=",", skiprows=1, usecols=(0, 1)) * 1e3
+    test = SILVERBOX_MULTISINE[0] + round(0.75 * (SILVERBOX_MULTISINE[1] - SILVERBOX_MULTISINE[0]))
+    u, y = (both - both[SILVERBOX_MULTISINE[0] + SILVERBOX_SKIPPED : test].mean(axis=0)).T
+    whole = scipy.interpolate.CubicSpline(np.arange(len(u)), u).antiderivative()
+    u, y = np.diff(whole(np.arange(first, last + 1))), y[first:last]
+    names, units = {"u": "input", "y": "oscillator"}, {"u": "mV", "y": "mV"}
+    return IOData(u=u, y=y, dt=1.0 / 610.35, names=names, units=units)
+
+
+def silverbox(folder: Path) -> Outcome:
+    multisine, end = SILVERBOX_MULTISINE
+    test = multisine + round(0.75 * (end - multisine))
+    first = multisine + SILVERBOX_SKIPPED
+    data = silverbox_part(folder, first, first + SILVERBOX_SEARCHED)
+    structure = PortedMassSpringDamper(data)
+    linear, loop = both(structure, data)
+    rows = []
+    arrow = [_silverbox_errors(structure, one, silverbox_part(folder, 100, 40576)) for one in (linear, loop)]
+    sines = [_silverbox_errors(structure, one, silverbox_part(folder, test, end)) for one in (linear, loop)]
+    for metric, errors, published in (
+        ("multisine, mV", [rms(one[SILVERBOX_SKIPPED:]) for one in sines], 0.36),
+        ("arrow, mV", [rms(one[SILVERBOX_SKIPPED:]) for one in arrow], 0.26),
+        ("arrow inside, mV", [rms(one[SILVERBOX_SKIPPED:32000]) for one in arrow], 0.32),
+    ):
+        rows.append(Row("Silverbox", metric, *errors, published, published))
+    return Outcome(loop, tuple(rows), "")
+
+
+def _silverbox_errors(structure, loop: Loop, data: IOData) -> np.ndarray:
+    return np.asarray(data.y) - simulated(structure, loop, data)
+
+
+# --- Quarter drone ---------------------------------------------------------------------------------
+
+DRONE_THINNED = 4
+
+
+def drone_file(folder: Path, name: str) -> IOData:
+    """Command %, angle rad: laws of an angle take it in rad."""
+    file = folder / "quarter_drone" / name
+    degrees, command = np.loadtxt(file, delimiter=",", skiprows=1, usecols=(2, 3)).T
+    u, y = held(command, np.deg2rad(degrees), DRONE_THINNED)
+    names, units = {"u": "command", "y": "arm"}, {"u": "%", "y": "rad"}
+    return IOData(u=u, y=y, dt=0.01 * DRONE_THINNED, names=names, units=units)
+
+
+def quarter_drone(folder: Path) -> Outcome:
+    data = drone_file(folder, "sinal4_multiseno_malha_fechada.csv")
+    structure = Servo(data)
+    linear, loop = both(structure, data)
+    test = drone_file(folder, "sinal3_swept_sine_malha_fechada.csv")
+    errors = [
+        float(np.rad2deg(rms(np.asarray(test.y) - simulated(structure, one, test))))
+        for one in (linear, loop)
+    ]
+    return Outcome(loop, (Row("quarter drone", "swept sine, degrees", *errors, None, 3.0),), "")
+
+
+# --- DaISy -----------------------------------------------------------------------------------------
+
+
+def _daisy(folder: Path, file: str, channels: int, name: str) -> Outcome:
+    """Black box on the first half; the fit of a simulation of the second half."""
+    values = np.loadtxt(folder / "daisy" / file)
+    whole = IOData(u=values[:, :channels], y=values[:, channels:], dt=1.0)
+    data, test = whole.split(0.5)
+    structure = BlackBox(data)
+    linear, loop = both(structure, data)
+    size = np.asarray(test.y).std(axis=0)
+    rows = []
+    errors = [np.asarray(test.y) - simulated(structure, one, test) for one in (linear, loop)]
+    for output in range(channels):
+        shares = [100.0 * rms(one[:, output]) / float(size[output]) for one in errors]
+        rows.append(Row(name, f"y{output + 1}, % of its spread", *shares, None, None))
+    return Outcome(loop, tuple(rows), f"order {structure.order}")
+
+
+def robot_arm(folder: Path) -> Outcome:
+    return _daisy(folder, "robot_arm.dat", 1, "DaISy robot arm")
+
+
+def cd_arm(folder: Path) -> Outcome:
+    return _daisy(folder, "CD_player_arm.dat", 2, "DaISy CD arm")
+
+
+# --- Coupled drives --------------------------------------------------------------------------------
+
+
+def coupled_drives(folder: Path) -> Outcome:
+    """Low and high amplitude together; what the sensor says of the belt's speed."""
+    values = np.loadtxt(folder / "ced" / "DATAUNIF.csv", delimiter=",", skiprows=1, usecols=range(4))
+    u, y = values[:, :2], values[:, 2:]
+    names = {"u": "voltage", "y": "pulley"}
+    data, test = (
+        IOData(u=[u[part, k] for k in (0, 1)], y=[y[part, k] for k in (0, 1)], dt=0.02, names=names)
+        for part in (slice(0, 400), slice(400, 500))
+    )
+    structure = BlackBox(data, order=3)
+    linear, loop = both(structure, data)
+    errors = [np.asarray(test.y) - simulated(structure, one, test) for one in (linear, loop)]
+    rows = []
+    for k, (name, published) in enumerate((("low", 0.096), ("high", 0.0945))):
+        own = [rms(one[100 * k + 4 : 100 * (k + 1)]) for one in errors]
+        rows.append(Row("coupled drives", f"{name}, V", *own, published, published))
+    return Outcome(loop, tuple(rows), "")
+
+
+RECORDS: dict[str, Callable[[Path], Outcome]] = {
+    "emps": emps,
+    "silverbox": silverbox,
+    "quarter-drone": quarter_drone,
+    "robot-arm": robot_arm,
+    "cd-arm": cd_arm,
+    "coupled-drives": coupled_drives,
+}
+
+
+def told(name: str, outcome: Outcome, seconds: float) -> list[str]:
+    """The verdict and the effects in lines of text."""
+    loop = outcome.loop
+    lines = [f"{name}: {loop.verdict} ({seconds:.0f} s, {loop.tests_made} tests) {outcome.remark}"]
+    for effect in loop.effects:
+        numbers = ", ".join(
+            f"{number.name} = {number.value:.5g} ± {number.std:.2g} {number.unit}".rstrip()
+            for number in effect.parameters
+        )
+        also = f"; or {', '.join(effect.confusable_with)}" if effect.confusable_with else ""
+        lines.append(f"    {effect.name} at {effect.port}: {numbers}{also}")
+    if not loop.effects and loop.rounds and loop.rounds[0]:
+        best = ", ".join(f"{one.name} at {one.port}" for one in loop.rounds[0][:3])
+        lines.append(f"    first of the ranking: {best}; p = {loop.p_value:.2g}")
+    return lines
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", help="folder of the records; LPVID_DATA by default")
+    parser.add_argument("--only", nargs="+", choices=tuple(RECORDS), default=tuple(RECORDS))
+    arguments = parser.parse_args()
+    folder = data_folder(arguments.data)
+    if not folder.is_dir():
+        print(f"{folder} is not there: set LPVID_DATA to the folder of the records.")
+        return
+    rows: list[Row] = []
+    for name in tqdm(arguments.only):
+        begun = time.perf_counter()
+        with warnings.catch_warnings():
+            # The black box of a poor start may be unstable; its errors say so.
+            warnings.simplefilter("ignore")
+            outcome = RECORDS[name](folder)
+        tqdm.write("\n".join(told(name, outcome, time.perf_counter() - begun)))
+        rows += outcome.rows
+    print(text_table(rows, ["record", "metric", "linear", "with effects", "published", "goal"]))
+
+
+if __name__ == "__main__":
+    main()
