@@ -19,9 +19,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.interpolate
 import scipy.io
 import scipy.signal
 from tqdm import tqdm
@@ -33,9 +33,9 @@ from lpvid.loop._assess import free_run
 from lpvid.loop._candidates import places_of, port_name, slots_of
 from lpvid.loop._program import Setting
 from lpvid.loop._records import records_of, schedule_names, scheduling_nodes
-from lpvid.loop._search import run, search
+from lpvid.loop._search import run
 from lpvid.loop._tune import Fitted, empty_unknowns
-from lpvid.loop.structures import BlackBox, PortedMassSpringDamper, Servo
+from lpvid.loop.structures import BlackBox, Servo
 from lpvid.report import text_table
 
 
@@ -133,7 +133,7 @@ def rms(error: np.ndarray) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-# --- EMPS ------------------------------------------------------------------------------------------
+# --- EMPS ---
 
 EMPS_FILTER_HZ = (60.0, 10.0)
 """Of the position before it is differentiated, and of both sides of the force balance; of 20 to
@@ -174,21 +174,20 @@ def emps_force_error(loop: Loop, force: np.ndarray, position: np.ndarray) -> flo
     velocity, acceleration = emps_motion(position)
     inertia, viscous = (number.value for number in loop.parameters)
     asked = inertia * acceleration + viscous * velocity
-    signals = at(
-        position=position,
-        velocity=velocity,
-        acceleration=acceleration,
-        input=force,
-        time=1e-3 * np.arange(len(force)),
-    )
+    along = (position, velocity, acceleration, force, 1e-3 * np.arange(len(force)))
     for effect in loop.effects:
         own = law(effect.name)
         if own.memory or own.whole or "output" in effect.port:
             raise ValueError(f"{effect.name}: no inverse model is written for it.")
         values = [number.value for number in effect.parameters]
         count = len(own.amplitudes)
-        terms = own.regressors(signals, jnp.asarray(values[count:]), jnp.zeros(2))
-        asked = asked - np.asarray(jnp.asarray(values[:count]) @ terms)
+        shape = jnp.asarray(values[count:])
+
+        def terms(q, v, a, u, t, own=own, shape=shape):
+            here = at(position=q, velocity=v, acceleration=a, input=u, time=t)
+            return own.regressors(here, shape, jnp.zeros(2))
+
+        asked = asked - np.asarray(jax.vmap(terms)(*map(jnp.asarray, along))) @ values[:count]
     measured, modelled = (_low_passed(one, EMPS_FILTER_HZ[1])[20:-20] for one in (force, asked))
     return 100.0 * float(np.linalg.norm(modelled - measured) / np.linalg.norm(measured))
 
@@ -225,7 +224,7 @@ def emps(folder: Path) -> Outcome:
     return Outcome(loop, tuple(rows), "")
 
 
-# --- Silverbox -------------------------------------------------------------------------------------
+# --- Silverbox ---
 
 SILVERBOX_SEARCHED = 4000
 """Samples of the estimation part that the search takes: a sixteenth of it."""
@@ -235,17 +234,12 @@ SILVERBOX_MULTISINE = (40650, 127400)
 
 
 def silverbox_part(folder: Path, first: int, last: int) -> IOData:
-    """Samples of the file in mV, less the offsets of the estimation part.
-
-    The input is band-limited, not held: the mean of a cubic spline over each coming sample stands
-    for it, since the library holds an input over its sample.
-    """
+    """Samples of the file in mV, less the offsets of the estimation part."""
     file = folder / "silverbox" / "SNLS80mV.csv"
     both = np.loadtxt(file, delimiter=",", skiprows=1, usecols=(0, 1)) * 1e3
     test = SILVERBOX_MULTISINE[0] + round(0.75 * (SILVERBOX_MULTISINE[1] - SILVERBOX_MULTISINE[0]))
     u, y = (both - both[SILVERBOX_MULTISINE[0] + SILVERBOX_SKIPPED : test].mean(axis=0)).T
-    whole = scipy.interpolate.CubicSpline(np.arange(len(u)), u).antiderivative()
-    u, y = np.diff(whole(np.arange(first, last + 1))), y[first:last]
+    u, y = u[first:last], y[first:last]
     names, units = {"u": "input", "y": "oscillator"}, {"u": "mV", "y": "mV"}
     return IOData(u=u, y=y, dt=1.0 / 610.35, names=names, units=units)
 
@@ -255,11 +249,18 @@ def silverbox(folder: Path) -> Outcome:
     test = multisine + round(0.75 * (end - multisine))
     first = multisine + SILVERBOX_SKIPPED
     data = silverbox_part(folder, first, first + SILVERBOX_SEARCHED)
-    structure = PortedMassSpringDamper(data)
+    # The input is band-limited, not held: within a sample it moves, which feedthrough stands for.
+    structure = BlackBox(data, order=2, feedthrough=True)
     linear, loop = both(structure, data)
     rows = []
-    arrow = [_silverbox_errors(structure, one, silverbox_part(folder, 100, 40576)) for one in (linear, loop)]
-    sines = [_silverbox_errors(structure, one, silverbox_part(folder, test, end)) for one in (linear, loop)]
+    arrow = [
+        _silverbox_errors(structure, one, silverbox_part(folder, 100, 40576))
+        for one in (linear, loop)
+    ]
+    sines = [
+        _silverbox_errors(structure, one, silverbox_part(folder, test, end))
+        for one in (linear, loop)
+    ]
     for metric, errors, published in (
         ("multisine, mV", [rms(one[SILVERBOX_SKIPPED:]) for one in sines], 0.36),
         ("arrow, mV", [rms(one[SILVERBOX_SKIPPED:]) for one in arrow], 0.26),
@@ -269,13 +270,14 @@ def silverbox(folder: Path) -> Outcome:
     return Outcome(loop, tuple(rows), "")
 
 
-def _silverbox_errors(structure, loop: Loop, data: IOData) -> np.ndarray:
-    return np.asarray(data.y) - simulated(structure, loop, data)
-
-
-# --- Quarter drone ---------------------------------------------------------------------------------
+# --- Quarter drone ---
 
 DRONE_THINNED = 4
+DRONE_STRUCTURE = Servo
+
+
+def _drone(seconds: float) -> int:
+    return round(seconds / (0.01 * DRONE_THINNED))
 
 
 def drone_file(folder: Path, name: str) -> IOData:
@@ -288,8 +290,9 @@ def drone_file(folder: Path, name: str) -> IOData:
 
 
 def quarter_drone(folder: Path) -> Outcome:
-    data = drone_file(folder, "sinal4_multiseno_malha_fechada.csv")
-    structure = Servo(data)
+    # Before and after, the arm lies on its stop.
+    data = drone_file(folder, "sinal4_multiseno_malha_fechada.csv")[_drone(16.0) : _drone(92.0)]
+    structure = DRONE_STRUCTURE(data)
     linear, loop = both(structure, data)
     test = drone_file(folder, "sinal3_swept_sine_malha_fechada.csv")
     errors = [
@@ -299,7 +302,7 @@ def quarter_drone(folder: Path) -> Outcome:
     return Outcome(loop, (Row("quarter drone", "swept sine, degrees", *errors, None, 3.0),), "")
 
 
-# --- DaISy -----------------------------------------------------------------------------------------
+# --- DaISy ---
 
 
 def _daisy(folder: Path, file: str, channels: int, name: str) -> Outcome:
@@ -326,12 +329,14 @@ def cd_arm(folder: Path) -> Outcome:
     return _daisy(folder, "CD_player_arm.dat", 2, "DaISy CD arm")
 
 
-# --- Coupled drives --------------------------------------------------------------------------------
+# --- Coupled drives ---
 
 
 def coupled_drives(folder: Path) -> Outcome:
     """Low and high amplitude together; what the sensor says of the belt's speed."""
-    values = np.loadtxt(folder / "ced" / "DATAUNIF.csv", delimiter=",", skiprows=1, usecols=range(4))
+    values = np.loadtxt(
+        folder / "ced" / "DATAUNIF.csv", delimiter=",", skiprows=1, usecols=range(4)
+    )
     u, y = values[:, :2], values[:, 2:]
     names = {"u": "voltage", "y": "pulley"}
     data, test = (

@@ -23,6 +23,7 @@ SLOW = {
     "lpvid.identify._methods",
     "lpvid.identify.gray_box._black_box",
     "lpvid.identify.gray_box._mechanical",
+    "lpvid.loop._engine",
     "lpvid.mechanics._single_link_arm",
     "lpvid.mechanics._study_records",
     "lpvid.mechanics._two_link_arm",

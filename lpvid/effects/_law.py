@@ -26,7 +26,7 @@ parameter of the model."""
 
 
 class Signals(eqx.Module):
-    """What a law reads at its port, at one instant; scalars but for the history.
+    """What a law reads at its port, at one instant: scalars but for the history.
 
     At a force port position, velocity and acceleration are the coordinate's, and `load` is the
     force that the model transmits there. At an input port `input` is the commanded signal, at an
@@ -45,15 +45,15 @@ class Signals(eqx.Module):
         sample: time from one sample of the history to the next, s.
     """
 
-    position: Float[Array, ""]
-    velocity: Float[Array, ""]
-    acceleration: Float[Array, ""]
-    load: Float[Array, ""]
-    input: Float[Array, ""]
-    output: Float[Array, ""]
-    time: Float[Array, ""]
-    history: Float[Array, " lag"]
-    sample: Float[Array, ""]
+    position: Float[Array, "*path"]
+    velocity: Float[Array, "*path"]
+    acceleration: Float[Array, "*path"]
+    load: Float[Array, "*path"]
+    input: Float[Array, "*path"]
+    output: Float[Array, "*path"]
+    time: Float[Array, "*path"]
+    history: Float[Array, "*path lag"]
+    sample: Float[Array, "*path"]
 
 
 class Size(NamedTuple):

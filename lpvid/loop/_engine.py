@@ -67,7 +67,26 @@ def close_the_loop(
         ValueError: unusable records, too short ones, a split that leaves nothing, channels that
             do not suit the structure.
 
-    Source: the score test is that of C. R. Rao (1948), with the noise model profiled.
+    Not for `jit`, `vmap` or `grad`: what it does depends on what it finds. The predictor inside is
+    compiled once for each set of laws.
+
+    Source: the score test is that of C. R. Rao (Proc. Cambridge Phil. Soc. 44 (1948) 50–57), with
+    an autoregressive noise model profiled for each candidate; the predictor is a steady Kalman
+    filter whose diffusion is chosen by likelihood.
+
+    Example:
+        >>> generator = np.random.default_rng(0)
+        >>> u = np.repeat(generator.standard_normal(60), 10)
+        >>> position, speed, y = 0.0, 0.0, []
+        >>> for force in u:
+        ...     y.append(position + 1e-3 * generator.standard_normal())
+        ...     for _ in range(100):
+        ...         speed += 5e-4 * (force - speed - 0.4 * np.tanh(speed / 1e-3))
+        ...         position += 5e-4 * speed
+        >>> data = IOData(u=u, y=y, dt=0.05)
+        >>> found = close_the_loop(structure_named("servo", data), data)
+        >>> found.verdict, [effect.name for effect in found.effects]
+        ('named', ['coulomb'])
     """
     begun = time.perf_counter()
     checked(structure, data, test, split, most_effects)

@@ -110,12 +110,12 @@ class Injection(eqx.Module):
     """Signals added to the state and to the output, for sensitivities to effects not yet in.
 
     Attributes:
-        state: added to the next state (time, state).
-        output: added to the predicted output (time, ny).
+        state: added to the next state (time, state), with a leading axis where there are several.
+        output: added to the predicted output (time, ny), the same.
     """
 
-    state: Float[Array, "time state"]
-    output: Float[Array, "time ny"]
+    state: Float[Array, "*column time state"]
+    output: Float[Array, "*column time ny"]
 
 
 class Trace(eqx.Module):

@@ -106,7 +106,7 @@ class VirtualForce(NamedTuple):
 
     Attributes:
         effect: name of the effect.
-        regressor_name: with unit, such as "velocity at load [rad/s]".
+        regressor_name: with unit, such as "velocity at load (rad/s)".
         regressor: (time,).
         residual: what the model without this effect lacks at the effect's port (time,).
         law: what the effect adds there (time,).

@@ -115,7 +115,7 @@ def summarise(
         residual_tests=_classical(errors["after"], held_out),
         virtual_forces=virtual_forces(bench, fitted),
         series=Series(
-            np.arange(count) * held_out.dt,
+            (bench.first_sample + np.arange(count)) * held_out.dt,
             y,
             run_before,
             run_after,
@@ -135,7 +135,8 @@ def _both(base: Fitted, fitted: Fitted):
 
 def _label(bench: Bench, place: Place) -> str:
     law = bench.setting.laws[place.law]
-    return f"{law.name} at {port_name(bench.setting.structure, place, bench.schedules)}"
+    port = port_name(bench.setting.structure, place, bench.schedules)
+    return f"{law.name} at {port.removeprefix('force at ')}"
 
 
 def _ranked(bench: Bench, ranking: Ranking) -> tuple[Candidate, ...]:

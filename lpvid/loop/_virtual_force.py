@@ -112,4 +112,4 @@ def _named(structure, place: Place, reads: str) -> tuple[str, str]:
         unit, position = structure.force_units[index], structure.coordinate_units[index]
         what = f"{reads} at {structure.coordinate_names[index]}"
         own = {"velocity": f"{position}/s", "acceleration": f"{position}/s²"}.get(reads, position)
-    return (unit, "time [s]") if reads == "time" else (unit, f"{what} [{own}]")
+    return (unit, "time (s)") if reads == "time" else (unit, f"{what} ({own})")

@@ -1,6 +1,8 @@
 """The library as a whole: names, grids, units, and a law of a user's own."""
 
 import dataclasses
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import lpvid
 from lpvid import effects
 from lpvid.effects import LIBRARY, MEMORY, PORTS, Scales, Size, Units, at, fill, law
 
+README = Path(__file__).resolve().parents[2] / "README.md"
 FAMILIES = (
     "friction drag hysteresis stiffness backlash saturation gain delay lag mode gravity ripple "
     "disturbance bias drift sensor scheduling inertia"
@@ -103,15 +107,12 @@ def test_units_of_every_law_can_be_filled():
 
 
 def test_a_law_of_ones_own_in_ten_lines():
-    class QuinticStiffness(effects.AbstractShapelessLaw):
-        name = "quintic-stiffness"
-        family = "stiffness"
-        ports = ("force",)
-        amplitudes = (effects.Amplitude("k5", "{acts_on}/{position}^5"),)
-        whole = False
-
-        def regressors(self, signals, shape, memory):
-            return jnp.stack([-(signals.position**5)])
+    # The README's, as it is printed there.
+    (snippet,) = re.findall(r"```py\n(class .*?)\n\nfound", README.read_text(), flags=re.DOTALL)
+    assert len([line for line in snippet.splitlines() if line]) <= 10
+    namespace = {"lv": lpvid, "jnp": jnp}
+    exec(compile(snippet, "README.md", "exec"), namespace)
+    QuinticStiffness = namespace["QuinticStiffness"]
 
     library = (*LIBRARY, QuinticStiffness())
     own = law("quintic-stiffness", library)

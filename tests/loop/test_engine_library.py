@@ -7,7 +7,6 @@ import pytest
 
 import lpvid as lv
 from lpvid.effects import law
-from lpvid.loop import structure_named
 
 from .engine_records import NOISE, closed, coulomb, record
 

@@ -15,6 +15,9 @@ from lpvid.loop.structures._search import best_start, window_error
 from lpvid.loop.structures._units import per, times
 from lpvid.loop.structures._windows import windows_of
 
+_REACH = 30.0
+"""How far the inertia may lie from what the records' windows say."""
+
 
 class Servo(AbstractPortedStructure):
     """J q̈ + c q̇ = ± u: an inertia with viscous friction, driven by torque, current or voltage.
@@ -42,6 +45,7 @@ class Servo(AbstractPortedStructure):
     labels: Labels = eqx.field(static=True)
     output: Literal["position", "velocity"] = eqx.field(static=True)
     sign: float
+    inertia: float
     name: str = eqx.field(default="servo", static=True)
 
     def __init__(self, data: IOData, *, output: Literal["position", "velocity"] = "position"):
@@ -66,6 +70,7 @@ class Servo(AbstractPortedStructure):
         )
         rigid = rigid_body(windows_of(data, 2), ny=1, rate=output == "velocity")
         self.sign = -1.0 if np.median(np.sign(rigid[:, 0])) < 0.0 else 1.0
+        self.inertia = max(float(np.median(np.abs(rigid[:, 0]))), 1e-12)
 
     def ports(self, theta: Float[Array, " parameter"], kappa: Float[Array, " nk"]) -> Ports:
         """The matrices at θ = (J, c)."""
@@ -87,8 +92,9 @@ class Servo(AbstractPortedStructure):
         )
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """The inertia is positive."""
-        return np.array([1e-12, -np.inf]), np.full(2, np.inf)
+        """The inertia near what the windows say: without its missing load (gravity, a bias) the
+        model would else fit best with no input at all."""
+        return np.array([self.inertia / _REACH, -np.inf]), np.array([self.inertia * _REACH, np.inf])
 
     def start(self, data: IOData) -> np.ndarray:
         """θ by regression over windows and a search from there."""
