@@ -116,6 +116,8 @@ if file.exists() and not small:
     servo = lv.loop.structure_named("servo", carriage.split(2 / 3)[0])
     measured = lv.close_the_loop(servo, carriage)
     print(lv.report.loop_text(measured))
+    for one in measured.rounds[0][:5]:
+        print(f"first round: {one.name} ({one.port}), gain {one.gain:.0f}")
     lv.plot.loop(measured)
 else:
     print(f"{file} is not here: set LPVID_DATA to the folder of the measured records.")

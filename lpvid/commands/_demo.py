@@ -1,4 +1,4 @@
-"""`lpvid demo`: the study of Vizer et al. (2015) on the reference arm, with its report."""
+"""`lpvid demo`: the study of Vizer et al. (2015) on the reference arm, then a hidden effect."""
 
 import argparse
 import sys
@@ -13,11 +13,14 @@ from lpvid import __version__
 from lpvid._files import write_json
 from lpvid.commands._cache import keep_compiled_code
 from lpvid.commands._demo_figures import FIGURES
+from lpvid.commands._demo_loop import Ending, add_section, end
+from lpvid.commands._demo_loop import summary as ending_summary
 from lpvid.commands._demo_tables import SETTING, tables
 from lpvid.commands._messages import Warnings
 from lpvid.commands._output import make_folder
+from lpvid.mechanics import reference_two_link_arm
 from lpvid.plot import save_figure
-from lpvid.report import Report, text_table
+from lpvid.report import Report, loop_text, text_table
 from lpvid.study import StudyResult, run_study, summary
 
 # Stages that `run_study` announces.
@@ -33,7 +36,7 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-    with _Progress(_STAGES + 1) as progress:
+    with _Progress(_STAGES + 2) as progress:
         result = run_study(
             jax.random.key(arguments.seed), runs=arguments.runs, report=progress.begin
         )
@@ -41,21 +44,27 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
         drawn = time.perf_counter()
         pictures = _draw(result, folder)
         drawing = time.perf_counter() - drawn
+        progress.begin("Closing the loop on a record with a hidden effect")
+        closing = time.perf_counter()
+        ending = end(reference_two_link_arm(), arguments.seed)
+        closing = time.perf_counter() - closing
     figures = summary(result)
-    figures["seconds_by_stage"] = {**figures["seconds_by_stage"], "draw": drawing}
+    figures["seconds_by_stage"] = {**figures["seconds_by_stage"], "draw": drawing, "loop": closing}
     figures["seconds"] = time.perf_counter() - started
     content = {
         "study": figures,
+        "loop": ending_summary(ending),
         "seed": arguments.seed,
         "runs": arguments.runs,
         "version": __version__,
         "warnings": warnings.messages,
     }
     write_json(folder / "summary.json", content)
-    page = _report(result, pictures, arguments, figures["seconds"])
+    page = _report(result, pictures, arguments, figures["seconds"], ending, folder)
     page.write(folder / "report.html")
     for table in tables(result):
         print(f"{table.title}\n{text_table(table.rows, table.headers)}\n")
+    print(f"A hidden effect: {loop_text(ending.found)}\n")
     print(f"{figures['seconds']:.0f} s in all. Report: {folder / 'report.html'}")
 
 
@@ -99,6 +108,8 @@ def _report(
     pictures: list[tuple[str, Path]],
     arguments: argparse.Namespace,
     seconds: float,
+    ending: Ending,
+    folder: Path,
 ) -> Report:
     page = Report("A two-link flexible arm: from noisy local records to an LPV model")
     page = page.paragraph(SETTING)
@@ -114,6 +125,7 @@ def _report(
         for name in table.figures:
             caption, path = by_name[name]
             page = page.figure(path, caption)
+    page = add_section(page, ending, folder)
     slowest = max(result.seconds, key=lambda stage: result.seconds[stage])
     rows = [(stage, float(np.round(value, 1))) for stage, value in result.seconds.items()]
     page = page.heading("Time").paragraph(f"Compilation included; most went to “{slowest}”.")

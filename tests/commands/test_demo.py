@@ -6,17 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from loop.loop_records import named
 
 from lpvid import commands
 from lpvid._results import Status
 from lpvid.analysis import bft, vaf
 from lpvid.commands import _demo, _demo_figures
+from lpvid.commands._demo_loop import Ending
 from lpvid.data import IOData
 from lpvid.interpolate import interpolate, interpolate_balanced
 from lpvid.mechanics import StudyRecords, reference_two_link_arm, two_link_arm_structure
 from lpvid.models import Polynomial
 from lpvid.restructure import Restructured
-from lpvid.study import MODEL_NAMES, StudyResult
+from lpvid.study import MODEL_NAMES, StudyResult, Undeclared
 
 PICTURES = (
     "records",
@@ -103,10 +105,15 @@ def test_files_and_tables_are_written(capsys, tmp_path, monkeypatch, result):
         report("Simulating")
         return result
 
+    def end(arm, seed):
+        asked.update(seed=seed)
+        return Ending(Undeclared(result.records.sweep, "coulomb", 2, 0.07, "N·m"), named(100))
+
     monkeypatch.setattr(_demo, "run_study", study)
+    monkeypatch.setattr(_demo, "end", end)
     folder = tmp_path / "new" / "demo"
     assert commands.main(["demo", "--out", str(folder), "--runs", "3", "--seed", "5"]) == 0
-    assert asked["runs"] == 3
+    assert asked["runs"] == 3 and asked["seed"] == 5
     assert jnp.array_equal(
         jax.random.key_data(asked["key"]), jax.random.key_data(jax.random.key(5))
     )
@@ -124,17 +131,19 @@ def test_files_and_tables_are_written(capsys, tmp_path, monkeypatch, result):
     assert {path.name for path in folder.iterdir()} == {
         "summary.json",
         "report.html",
-        *(f"{name}.png" for name in PICTURES),
+        "loop.html",
+        *(f"{name}.png" for name in (*PICTURES, "virtual_forces", "held_out")),
     }
+    assert content["loop"]["hidden"]["name"] == content["loop"]["effects"][0]["name"] == "coulomb"
     page = (folder / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == len(PICTURES)
+    assert page.count("data:image/png;base64,") == len(PICTURES) + 2
     assert "<script" not in page and "http" not in page.replace("http-equiv", "")
     for number in (1, 2, 3, 4):
         assert f"Table {number}." in page
     captured = capsys.readouterr()
     assert "Table 4." in captured.out
     assert captured.out.rstrip().endswith(f"Report: {folder / 'report.html'}")
-    assert "[1/6] Simulating" in captured.err
+    assert "[1/7] Simulating" in captured.err
     # 001's figures stand beside: θ2 = 2π/8 in table 1, restructured y1 in table 4.
     assert "91.23" in captured.out and "76.2" in captured.out
 
@@ -151,10 +160,13 @@ def test_a_model_that_runs_away_leaves_the_sweep_readable(result):
 @pytest.mark.slow
 def test_one_run_of_the_whole_study(capsys, tmp_path):
     assert commands.main(["demo", "--out", str(tmp_path), "--runs", "1"]) == 0
-    study = json.loads((tmp_path / "summary.json").read_text())["study"]
+    content = json.loads((tmp_path / "summary.json").read_text())
+    study = content["study"]
     assert len(study["relative_cost"]) == 7
     assert np.min(study["local_bft"]) > 93.0
     restructured, analytic, balanced = (np.array(study["bft"][name]) for name in MODEL_NAMES)
     assert np.all(restructured > analytic - 1.0)
     assert np.all(restructured > balanced)
+    assert content["loop"]["verdict"] == "named"
+    assert [effect["name"] for effect in content["loop"]["effects"]] == ["coulomb"]
     assert "Table 4." in capsys.readouterr().out

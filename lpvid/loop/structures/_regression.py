@@ -65,7 +65,7 @@ def least_squares(
 
 
 def rigid_body(
-    scales: Sequence[Windows], *, ny: int, rate: bool = False
+    scales: Sequence[Windows], *, ny: int, rate: bool = False, spring: bool = False
 ) -> Float[np.ndarray, "scale 2"]:
     """Inertia and viscous friction for one unit of input, by windows of each length.
 
@@ -73,6 +73,7 @@ def rigid_body(
         scales: windows of one input and `ny` outputs, of which the first counts.
         ny: number of outputs.
         rate: whether the output is a velocity.
+        spring: whether a load in proportion to the position is told apart and left out.
     """
     rows = []
     for windows in scales:
@@ -80,6 +81,8 @@ def rigid_body(
         above, below = known.accelerations, known.velocities
         if rate:
             above, below = known.velocities, known.positions
-        regressors = np.stack([above[0], below[0]], axis=1)
-        rows.append(least_squares(regressors, known.inputs[0]))
+        parts = [above[0], below[0]]
+        if spring and not rate:
+            parts.append(known.positions[0])
+        rows.append(least_squares(np.stack(parts, axis=1), known.inputs[0])[:2])
     return np.array(rows)

@@ -15,9 +15,6 @@ from lpvid.loop.structures._search import best_start, window_error
 from lpvid.loop.structures._units import per, times
 from lpvid.loop.structures._windows import windows_of
 
-_REACH = 30.0
-"""How far the inertia may lie from what the records' windows say."""
-
 
 class Servo(AbstractPortedStructure):
     """J q̈ + c q̇ = ± u: an inertia with viscous friction, driven by torque, current or voltage.
@@ -45,7 +42,6 @@ class Servo(AbstractPortedStructure):
     labels: Labels = eqx.field(static=True)
     output: Literal["position", "velocity"] = eqx.field(static=True)
     sign: float
-    inertia: float
     name: str = eqx.field(default="servo", static=True)
 
     def __init__(self, data: IOData, *, output: Literal["position", "velocity"] = "position"):
@@ -68,9 +64,9 @@ class Servo(AbstractPortedStructure):
             coordinate_units=(position,),
             force_units=data.input_units,
         )
-        rigid = rigid_body(windows_of(data, 2), ny=1, rate=output == "velocity")
+        # Gravity must not decide on the sign.
+        rigid = rigid_body(windows_of(data, 2), ny=1, rate=output == "velocity", spring=True)
         self.sign = -1.0 if np.median(np.sign(rigid[:, 0])) < 0.0 else 1.0
-        self.inertia = max(float(np.median(np.abs(rigid[:, 0]))), 1e-12)
 
     def ports(self, theta: Float[Array, " parameter"], kappa: Float[Array, " nk"]) -> Ports:
         """The matrices at θ = (J, c)."""
@@ -92,9 +88,8 @@ class Servo(AbstractPortedStructure):
         )
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """The inertia near what the windows say: without its missing load (gravity, a bias) the
-        model would else fit best with no input at all."""
-        return np.array([self.inertia / _REACH, -np.inf]), np.array([self.inertia * _REACH, np.inf])
+        """The inertia is positive."""
+        return np.array([1e-12, -np.inf]), np.full(2, np.inf)
 
     def start(self, data: IOData) -> np.ndarray:
         """θ by regression over windows and a search from there."""
