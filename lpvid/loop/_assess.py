@@ -113,7 +113,7 @@ def noise_in(residual: np.ndarray) -> np.ndarray:
     )
     high = density[frequency > 0.5 * _HIGH]
     # White noise of variance σ² has the one-sided density 2 σ² at one sample a second.
-    return np.sqrt(0.5 * np.median(high, axis=0))
+    return np.sqrt(0.5 * np.mean(high, axis=0))
 
 
 def robust_covariance(fitted: Fitted) -> np.ndarray:

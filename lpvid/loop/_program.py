@@ -159,9 +159,7 @@ def node_matrices(
     if setting.varying:
         amounts = unknowns.amplitude[:, :1, 0] * slots.parameter
         follow = records.schedules @ slots.schedule.T
-        thetas = jnp.concatenate(
-            [thetas, unknowns.theta * (1.0 + amounts), unknowns.theta * (1.0 - amounts)]
-        )
+        thetas = jnp.concatenate([thetas, thetas * (1.0 + amounts), thetas * (1.0 - amounts)])
         up, down = 0.5 * (follow**2 + follow), 0.5 * (follow**2 - follow)
         middle = 1.0 - jnp.sum(follow**2, axis=1, keepdims=True)
         factors = jnp.concatenate([middle, up, down], axis=1)

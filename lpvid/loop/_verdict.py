@@ -10,6 +10,9 @@ LEVEL = 0.01
 NEAR = 1.15
 """Error over noise floor up to which what is left counts as nothing."""
 
+FAR = 1.3
+"""Error over noise floor from which something is left whatever the tests of the library say."""
+
 EXPLAINED = 0.9
 """Share of the error power above the floor that effects must explain to be named at all."""
 
@@ -53,7 +56,9 @@ def decide(evidence: Evidence) -> tuple[str, str]:
     Args:
         evidence: what it rests on.
     """
-    left = evidence.p_value_left < LEVEL and not evidence.near <= NEAR
+    # Written so that errors that are not numbers count as far away.
+    seen = evidence.p_value_left < LEVEL and not evidence.near <= NEAR
+    left = seen or not evidence.near <= FAR
     if not evidence.named:
         if evidence.p_value >= LEVEL:
             return "nothing to add", (

@@ -56,7 +56,9 @@ def test_two_effects_are_both_named():
     assert found.keys() == {"coulomb", "cubic-stiffness"}
     for name, truth in (("coulomb", 0.3), ("cubic-stiffness", 600.0)):
         assert found[name].value == pytest.approx(truth, rel=0.02)
-    assert set(loop.ablation) == {f"{e.name} at {e.port}" for e in loop.effects}
+    assert set(loop.ablation) == {
+        f"{e.name} at {e.port.removeprefix('force at ')}" for e in loop.effects
+    }
     np.testing.assert_allclose(loop.after.one_step, NOISE, rtol=0.2)
 
 

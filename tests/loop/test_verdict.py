@@ -17,9 +17,9 @@ CLOSE, FAR = 1.0, 2.0 * NEAR
         (NO, NO, False, CLOSE, 0.0, "nothing to add"),
         (YES, YES, False, CLOSE, 0.0, "nothing to add"),
         (YES, YES, False, FAR, 0.0, "abstain"),
-        # Named: nothing left, too little left to matter, something left.
+        # Named: nothing left, too little left to matter, something left, seen by a test or not.
         (YES, NO, True, CLOSE, 0.99, "named"),
-        (YES, NO, True, FAR, 0.99, "named"),
+        (YES, NO, True, FAR, 0.99, "named, remainder unknown"),
         (YES, YES, True, CLOSE, 0.99, "named"),
         (YES, YES, True, FAR, EXPLAINED, "named, remainder unknown"),
         (YES, YES, True, FAR, 0.5 * EXPLAINED, "abstain"),
