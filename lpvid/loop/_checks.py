@@ -10,24 +10,15 @@ _LEAST_SAMPLES = 100
 _LEAST_HELD_OUT = 50
 
 
-def checked(
-    structure: AbstractPortedStructure,
-    data: IOData,
-    test: IOData | None,
-    split: float,
-    most_effects: int,
-) -> None:
-    """Refuse what cannot give an answer, with the reason and the remedy.
+def checked_options(test: IOData | None, split: float, most_effects: int) -> None:
+    """Refuse choices that leave nothing to do.
 
     Args:
-        structure: the base model.
-        data: records.
         test: other records, if any.
         split: share that estimates.
         most_effects: effects to add at most.
 
     Raises:
-        DataError: non-finite, constant or too short signals, or ones that do not fit.
         ValueError: an unusable split or number of effects.
     """
     if not 1 <= most_effects <= SLOTS:
@@ -37,6 +28,22 @@ def checked(
             f"split={split} must lie between 0.2 and 0.9: it is the share of each record that "
             "estimates, the rest decides."
         )
+
+
+def checked_records(
+    structure: AbstractPortedStructure, data: IOData, test: IOData | None, split: float
+) -> None:
+    """Refuse records that cannot give an answer, with the reason and the remedy.
+
+    Args:
+        structure: the base model.
+        data: records.
+        test: other records, if any.
+        split: share that estimates.
+
+    Raises:
+        DataError: non-finite, constant or too short signals, or ones that do not fit.
+    """
     for name, one in (("data", data), ("test", test)):
         if one is not None:
             _check_channels(name, one, structure)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,7 @@ from lpvid.data import IOData
 from lpvid.effects import LIBRARY, AbstractLaw
 from lpvid.loop._assess import noise_in
 from lpvid.loop._bench import Bench
-from lpvid.loop._checks import checked
+from lpvid.loop._checks import checked_options, checked_records
 from lpvid.loop._compare import better
 from lpvid.loop._ported import AbstractPortedStructure
 from lpvid.loop._program import SLOTS, Setting
@@ -29,10 +30,11 @@ from lpvid.loop._rounds import (
 from lpvid.loop._summary import summarise
 from lpvid.loop._tune import Fitted, empty_unknowns, fit, rough_noise
 from lpvid.loop._verdict import LEVEL
+from lpvid.loop.structures import PortedModel, structure_named
 
 
 def close_the_loop(
-    structure: AbstractPortedStructure,
+    model: Any,
     data: IOData,
     *,
     test: IOData | None = None,
@@ -44,13 +46,17 @@ def close_the_loop(
 ) -> Loop:
     """Find what a model lacks in measured records, add it, and report the error before and after.
 
-    The structure's parameters are started and fitted from the records; the predictor's residual is
+    Its parameters are started and fitted from the records; the predictor's residual is
     tested against every law of the library at every port; the best few are refitted, their shapes
     free, and only what predicts held-out data better is added; at most three effects, each
     questioned again once another is in.
 
+    Not for `jit`, `vmap` or `grad`: what it does depends on what it finds. The predictor inside is
+    compiled once for each set of laws.
+
     Args:
-        structure: the base model with its ports.
+        model: a structure with ports (`lpvid.loop.structures`), the name of one, or any linear
+            model that `PortedModel` takes: a `StateSpace`, a fit, a gray-box or an LPV model.
         data: one or several records, each with both estimation and held-out data in it unless
             `test` is given.
         test: other records for the held-out errors and decisions; all of `data` then estimates.
@@ -67,9 +73,6 @@ def close_the_loop(
         ValueError: unusable records, too short ones, a split that leaves nothing, channels that
             do not suit the structure.
 
-    Not for `jit`, `vmap` or `grad`: what it does depends on what it finds. The predictor inside is
-    compiled once for each set of laws.
-
     Source: the score test is that of C. R. Rao (Proc. Cambridge Phil. Soc. 44 (1948) 50–57), with
     an autoregressive noise model profiled for each candidate; the predictor is a steady Kalman
     filter whose diffusion is chosen by likelihood.
@@ -84,12 +87,14 @@ def close_the_loop(
         ...         speed += 5e-4 * (force - speed - 0.4 * np.tanh(speed / 1e-3))
         ...         position += 5e-4 * speed
         >>> data = IOData(u=u, y=y, dt=0.05)
-        >>> found = close_the_loop(structure_named("servo", data), data)
+        >>> found = close_the_loop("servo", data)
         >>> found.verdict, [effect.name for effect in found.effects]
         ('named', ['coulomb'])
     """
     begun = time.perf_counter()
-    checked(structure, data, test, split, most_effects)
+    checked_options(test, split, most_effects)
+    structure = _structure(model, data if test is not None else data.split(split)[0])
+    checked_records(structure, data, test, split)
     bench = _bench(structure, data, test, split, tuple(laws))
     with tqdm(total=most_effects + 3, disable=not progress, desc="fitting") as bar:
         base = _base(bench)
@@ -99,6 +104,15 @@ def close_the_loop(
         loop = summarise(bench, base, fitted, chosen, rankings, horizon)
         bar.update()
     return loop._replace(seconds=time.perf_counter() - begun)
+
+
+def _structure(model: Any, train: IOData) -> AbstractPortedStructure:
+    """What was given, as a structure with ports."""
+    if isinstance(model, AbstractPortedStructure):
+        return model
+    if isinstance(model, str):
+        return structure_named(model, train)
+    return PortedModel(model, train)
 
 
 def _bench(structure, data, test, split, laws) -> Bench:

@@ -71,7 +71,7 @@ def _one(bench: Bench, fitted: Fitted, slot: int, place: Place) -> VirtualForce:
         residual = moved @ (weight * column) / max(float(column @ (weight * column)), 1e-300)
     family = bench.setting.laws[place.law].family
     reads = {"input": "input", "output": "output"}.get(place.port, _READS.get(family, "velocity"))
-    signals = signals_at(own.signals["start"], records, place, full.setting.dt)
+    signals = signals_at(own.signals["before"], records, place, full.setting.dt)
     regressor = np.asarray(getattr(signals, reads))
     unit, named = _named(structure, place, reads)
     return VirtualForce(
@@ -88,8 +88,9 @@ def _contribution(own: Along, fitted: Fitted, slot: int, place: Place) -> np.nda
     """What the effect adds at its port (time,), along the model's first direction."""
     law = fitted.setting.laws[place.law]
     shape = np.asarray(fitted.unknowns.shape[slot])[None, : len(law.shapes)]
-    level, change, sensed = regressors(fitted.setting, place, shape, own.signals, own.records)
-    values = sensed[0] if place.port == "output" else level[0] + 0.5 * change[0]
+    # At the samples, not the mean over the steps, in which a velocity may turn.
+    _, _, sensed = regressors(fitted.setting, place, shape, own.signals, own.records)
+    values = sensed[0]
     return values @ np.asarray(fitted.unknowns.amplitude[slot, : values.shape[1], 0])
 
 

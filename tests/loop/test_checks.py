@@ -52,3 +52,8 @@ def test_samples_that_are_no_numbers_never_get_that_far():
 def test_an_unknown_structure_is_answered_with_the_known_ones():
     with pytest.raises(ValueError, match="'robot' is not known: give one of black-box, servo"):
         structure_named("robot", DATA)
+
+
+def test_a_name_that_is_no_structure_is_told_the_others():
+    with pytest.raises(ValueError, match="structure 'server' is not known: give one of black-box"):
+        close_the_loop("server", DATA)

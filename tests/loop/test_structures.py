@@ -76,7 +76,7 @@ def test_masses_springs_and_dampers():
     assert structure.coordinate_names == ("y1", "y2", "y1 - y2")
 
 
-@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("outputs", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_flexible_joint_in_closed_loop(outputs):
     _, theta = _started("flexible-joint", _joint(outputs, offset=0.5, bias=0.3))
     np.testing.assert_allclose(theta[:3], JOINT[:3], rtol=0.02)
@@ -86,6 +86,7 @@ def test_a_flexible_joint_in_closed_loop(outputs):
     np.testing.assert_allclose(theta[:3], JOINT[:3], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_a_single_link_arm_and_its_strain():
     # Hub, then two clamped modes as appendages: J, ω, ζ, and what a gauge reads of each.
     hub, friction = 0.02, 0.15
@@ -102,6 +103,7 @@ def test_a_single_link_arm_and_its_strain():
     np.testing.assert_allclose(theta, [hub, friction, *modes, 20.0, 8.0], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_a_black_box_finds_order_and_poles():
     structure, theta = _started("black-box", _joint(2, offset=1.0))
     assert structure.order == 4
