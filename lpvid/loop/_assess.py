@@ -6,7 +6,7 @@ import numpy as np
 import scipy.signal
 
 from lpvid.analysis import bft
-from lpvid.loop._compare import window
+from lpvid.loop._compare import whitener, window
 from lpvid.loop._program import Records
 from lpvid.loop._result import Errors
 from lpvid.loop._search import run
@@ -124,8 +124,7 @@ def robust_covariance(fitted: Fitted) -> np.ndarray:
     """
     errors, columns = fitted.searched.errors, fitted.searched.columns
     samples = errors.shape[0]
-    covariance = errors.T @ errors / samples
-    white = np.linalg.inv(np.linalg.cholesky(covariance)).T
+    white = whitener(errors)
     rows = np.einsum("ny,yz->nz", errors, white)
     design = np.einsum("nyc,yz->nzc", columns, white)
     gram = np.einsum("nzc,nzd->cd", design, design, optimize=True)

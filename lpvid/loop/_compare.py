@@ -27,6 +27,16 @@ def long_run_variance(values: np.ndarray) -> float:
     return max(total / values.size, 1e-300)
 
 
+def whitener(errors: np.ndarray) -> np.ndarray:
+    """W for which errors W have unit covariance (ny, ny).
+
+    Args:
+        errors: (time, ny).
+    """
+    covariance = errors.T @ errors / errors.shape[0]
+    return np.linalg.inv(np.linalg.cholesky(covariance)).T
+
+
 def sample_likelihood(errors: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Gaussian log-likelihood of each sample (time,).
 

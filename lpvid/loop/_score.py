@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.stats
 
+from lpvid.loop._compare import whitener
+
 _ORDER = 4
 _ROUNDS = 4
 _RANK = 1e-10
@@ -58,8 +60,7 @@ class ScoreTest:
         self.order = order
         self.samples, self.outputs, self.base_columns = base.shape
         # Outputs are decorrelated first, so that each has its own autoregression.
-        covariance = errors.T @ errors / self.samples
-        self.white = np.linalg.inv(np.linalg.cholesky(covariance)).T
+        self.white = whitener(errors)
         stacked = np.concatenate([errors[:, :, None], base], axis=2)
         self.known = self._lagged(np.einsum("nyc,yz->nzc", stacked, self.white))
         self.known_products = [known.T @ known for known in self.known]

@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from lpvid.loop._compare import whitener
 from lpvid.loop._program import (
     Injection,
     Records,
@@ -171,11 +172,6 @@ def log_likelihood(errors: np.ndarray) -> float:
     return float(-0.5 * errors.shape[0] * logarithm)
 
 
-def _whitener(errors: np.ndarray) -> np.ndarray:
-    covariance = errors.T @ errors / errors.shape[0]
-    return np.linalg.inv(np.linalg.cholesky(covariance)).T
-
-
 def _step(gram: np.ndarray, slope: np.ndarray, damping: float) -> np.ndarray:
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = np.linalg.eigh(gram / scale[:, None] / scale[None, :])
@@ -226,7 +222,7 @@ def search(
     for _ in range(steps):
         if not np.isfinite(reached):
             break
-        white = _whitener(errors)
+        white = whitener(errors)
         rows = np.einsum("ny,yz->nz", errors, white).reshape(-1)
         design = np.einsum("nyc,yz->nzc", columns, white).reshape(rows.size, -1)
         if not np.all(np.isfinite(design)):
