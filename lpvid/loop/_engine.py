@@ -21,6 +21,7 @@ from lpvid.loop._result import Loop
 from lpvid.loop._rounds import (
     Chosen,
     Ranking,
+    Rounds,
     choose,
     held_out_errors,
     likelihood_on,
@@ -28,9 +29,12 @@ from lpvid.loop._rounds import (
     without,
 )
 from lpvid.loop._summary import summarise
-from lpvid.loop._tune import Fitted, empty_unknowns, fit, rough_noise
+from lpvid.loop._tune import RATIOS, Fitted, empty_unknowns, fit, refit, rough_noise
 from lpvid.loop._verdict import LEVEL
 from lpvid.loop.structures import PortedModel, structure_named
+
+_SLOWER = 1.001e-3
+"""Diffusion of the slow gain over that of the likeliest one (a hair more, for rounding)."""
 
 
 def close_the_loop(
@@ -99,9 +103,9 @@ def close_the_loop(
     with tqdm(total=most_effects + 3, disable=not progress, desc="fitting") as bar:
         base = _base(bench)
         bar.update()
-        fitted, chosen, rankings = _rounds(bench, base, most_effects, bar)
+        found = _rounds(bench, base, most_effects, bar)
         bar.set_description("assessing")
-        loop = summarise(bench, base, fitted, chosen, rankings, horizon)
+        loop = summarise(bench, base, found, horizon)
         bar.update()
     return loop._replace(seconds=time.perf_counter() - begun)
 
@@ -149,26 +153,48 @@ def _base(bench: Bench) -> Fitted:
     return fit(bench.setting, bench.train, (), (), fitted.unknowns, noise, ratio=fitted.ratio)
 
 
-def _rounds(
-    bench: Bench, base: Fitted, most: int, bar: tqdm
-) -> tuple[Fitted, list[Chosen], list[Ranking]]:
-    fitted, chosen, rankings = base, [], []
+def _rounds(bench: Bench, base: Fitted, most: int, bar: tqdm) -> Rounds:
+    fitted, chosen, rankings, unfruitful = base, [], [], 0
     for _ in range(most):
         bar.set_description(f"round {len(rankings) + 1}")
         ranking = rank(fitted, bench.train, bench.schedules)
         rankings.append(ranking)
         if ranking.p_value > LEVEL:
-            return fitted, chosen, rankings
+            return Rounds(fitted, chosen, rankings, unfruitful)
         found = choose(fitted, ranking, bench.train, bench.held_out)
-        bar.update()
         if found is None:
-            return fitted, chosen, rankings
+            bar.set_description(f"round {len(rankings)}, slow gain")
+            found, slow = _at_slow_gain(bench, fitted)
+            if found is None:
+                bar.update()
+                return Rounds(fitted, chosen, rankings, unfruitful + slow.tests)
+            unfruitful += ranking.tests
+            rankings[-1] = slow
+        bar.update()
         fitted = found.fitted
         chosen.append(found)
         if len(chosen) > 1:
             fitted, chosen = _questioned(bench, fitted, chosen)
     rankings.append(rank(fitted, bench.train, bench.schedules))
-    return fitted, chosen, rankings
+    return Rounds(fitted, chosen, rankings, unfruitful)
+
+
+def _at_slow_gain(bench: Bench, fitted: Fitted) -> tuple[Chosen | None, Ranking]:
+    """A round with a predictor that follows its model for longer.
+
+    Diffusion takes what the model lacks for noise, and the faster gain that comes of it swallows
+    effects that act slowly. What is found is confirmed at the slow gain, then refitted with the
+    diffusion free.
+    """
+    wanted = _SLOWER * fitted.ratio
+    ratio = max((one for one in RATIOS if one <= wanted), default=RATIOS[0])
+    slow = refit(fitted, bench.train, ratio, (ratio,))
+    ranking = rank(slow, bench.train, bench.schedules)
+    found = choose(slow, ranking, bench.train, bench.held_out)
+    if found is None:
+        return None, ranking
+    free = refit(found.fitted, bench.train, fitted.ratio, fitted.ratios)
+    return found._replace(fitted=free), ranking
 
 
 def _questioned(bench: Bench, fitted: Fitted, chosen: list[Chosen]) -> tuple[Fitted, list[Chosen]]:

@@ -182,6 +182,22 @@ class Chosen(NamedTuple):
     p_value: float
 
 
+class Rounds(NamedTuple):
+    """What all rounds came to.
+
+    Attributes:
+        fitted: the model with what was found.
+        chosen: the effects, in the order of the model's slots.
+        rankings: of every round; the last found nothing, or is that of the final model.
+        unfruitful: tests of further rankings, which led nowhere.
+    """
+
+    fitted: Fitted
+    chosen: list[Chosen]
+    rankings: list[Ranking]
+    unfruitful: int
+
+
 def with_effect(fitted: Fitted, records: Records, entry: Ranked) -> Fitted:
     """The model refitted with a candidate in its next slot.
 
@@ -206,6 +222,7 @@ def with_effect(fitted: Fitted, records: Records, entry: Ranked) -> Fitted:
             unknowns,
             fitted.noise,
             ratio=model.ratio,
+            ratios=fitted.ratios,
         )
         if not _cramped(model, law):
             break
@@ -239,6 +256,7 @@ def _best_start(fitted: Fitted, records: Records, entry: Ranked, unknowns: Unkno
                 start,
                 fitted.noise,
                 ratio=fitted.ratio,
+                ratios=fitted.ratios,
                 cycles=1,
                 steps=4,
             )
@@ -281,6 +299,7 @@ def without(fitted: Fitted, records: Records, slot: int) -> Fitted:
         unknowns,
         fitted.noise,
         ratio=fitted.ratio,
+        ratios=fitted.ratios,
     )
 
 

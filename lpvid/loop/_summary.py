@@ -1,7 +1,5 @@
 """From fitted models to the record that the user gets."""
 
-from collections.abc import Sequence
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,7 +22,7 @@ from lpvid.loop._result import (
     Loop,
     Series,
 )
-from lpvid.loop._rounds import Chosen, Ranking, held_out_errors, without
+from lpvid.loop._rounds import Chosen, Ranking, Rounds, held_out_errors, without
 from lpvid.loop._score import family_wise
 from lpvid.loop._tune import Fitted, free_unknowns
 from lpvid.loop._verdict import Evidence, decide, explained
@@ -41,9 +39,7 @@ _SEPARATING = {
 def summarise(
     bench: Bench,
     base: Fitted,
-    fitted: Fitted,
-    chosen: Sequence[Chosen],
-    rankings: Sequence[Ranking],
+    found: Rounds,
     horizon: int | None,
 ) -> Loop:
     """Everything the report shows.
@@ -51,11 +47,10 @@ def summarise(
     Args:
         bench: what the call works with.
         base: the model without effects.
-        fitted: the model with them.
-        chosen: the effects, in the order of the model's slots.
-        rankings: of every round.
+        found: what the rounds came to.
         horizon: samples, or `None` for a twentieth of the held-out record.
     """
+    fitted, chosen, rankings, unfruitful = found
     held_out = bench.data[1]
     count = held_out.n_samples
     if horizon is None:
@@ -109,7 +104,7 @@ def summarise(
         ladder=Ladder(np.arange(1, horizon + 1), ladder_before, ladder_after),
         p_value=evidence.p_value,
         p_value_left=evidence.p_value_left,
-        tests_made=int(sum(ranking.tests for ranking in rankings)),
+        tests_made=int(sum(ranking.tests for ranking in rankings)) + unfruitful,
         rounds=tuple(_ranked(bench, ranking) for ranking in rankings),
         ablation=ablation,
         residual_tests=_classical(errors["after"], held_out),

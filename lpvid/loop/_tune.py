@@ -36,6 +36,7 @@ class Fitted(NamedTuple):
         ratio: diffusion.
         noise: standard deviation of the outputs' noise that the gain was made for (ny,).
         searched: errors, derivatives, likelihood.
+        ratios: diffusions that refits may choose from.
     """
 
     setting: Setting
@@ -47,6 +48,7 @@ class Fitted(NamedTuple):
     ratio: float
     noise: np.ndarray
     searched: Searched
+    ratios: tuple[float, ...] = RATIOS
 
 
 _gains = eqx.filter_jit(gains)
@@ -150,6 +152,7 @@ def fit(
     noise: np.ndarray,
     *,
     ratio: float = RATIOS[-2],
+    ratios: tuple[float, ...] = RATIOS,
     cycles: int = 8,
     steps: int = 12,
 ) -> Fitted:
@@ -163,6 +166,7 @@ def fit(
         unknowns: where to start.
         noise: standard deviation of the outputs' noise (ny,).
         ratio: diffusion to start with.
+        ratios: those to choose from.
         cycles: how often diffusion and parameters take turns at most.
         steps: of each search.
     """
@@ -175,16 +179,16 @@ def fit(
         return _gains(setting, records, values.theta, spread, jnp.asarray(float(level)))
 
     def choose(values, near):
-        at = RATIOS.index(near)
+        at = ratios.index(near)
         # Far off, the optimum is worth a look only when a neighbour is better.
-        ratios = RATIOS[max(at - 2, 0) : at + 2]
+        neighbours = ratios[max(at - 2, 0) : at + 2]
         count = int(np.sum(np.asarray(records.counts)))
         scored = []
-        for level in ratios:
+        for level in neighbours:
             gain = gain_of(values, level)
             errors = np.asarray(run(setting, records, slots, values, gain).innovations)[:count]
             scored.append(log_likelihood(errors))
-        return ratios[int(np.argmax(scored))]
+        return neighbours[int(np.argmax(scored))]
 
     best: tuple[Searched, Array, float] | None = None
     for _ in range(cycles):
@@ -193,14 +197,44 @@ def fit(
         reached = -np.inf if best is None else best[0].log_likelihood
         if best is None or found.log_likelihood > reached:
             best = found, gain, ratio
-        following = choose(found.unknowns, ratio)
+        following = choose(found.unknowns, ratio) if len(ratios) > 1 else ratio
         if following == ratio or found.log_likelihood < reached + _WORTH:
             break
         unknowns, ratio = found.unknowns, following
     assert best is not None
     found, gain, ratio = best
     return Fitted(
-        setting, tuple(places), tuple(scales), slots, found.unknowns, gain, ratio, noise, found
+        setting=setting,
+        places=tuple(places),
+        scales=tuple(scales),
+        slots=slots,
+        unknowns=found.unknowns,
+        gain=gain,
+        ratio=ratio,
+        noise=noise,
+        searched=found,
+        ratios=ratios,
+    )
+
+
+def refit(fitted: Fitted, records: Records, ratio: float, ratios: tuple[float, ...]) -> Fitted:
+    """The same model fitted again with other diffusions to choose from.
+
+    Args:
+        fitted: the model.
+        records: estimation data.
+        ratio: diffusion to start with.
+        ratios: those to choose from.
+    """
+    return fit(
+        fitted.setting,
+        records,
+        fitted.places,
+        fitted.scales,
+        fitted.unknowns,
+        fitted.noise,
+        ratio=ratio,
+        ratios=ratios,
     )
 
 

@@ -13,6 +13,9 @@ NEAR = 1.15
 FAR = 1.3
 """Error over noise floor from which something is left whatever the tests of the library say."""
 
+NEARLY_ALL = 0.999
+"""Share explained from which `FAR` no longer counts: only what a test sees is left then."""
+
 EXPLAINED = 0.9
 """Share of the error power above the floor that effects must explain to be named at all."""
 
@@ -58,7 +61,7 @@ def decide(evidence: Evidence) -> tuple[str, str]:
     """
     # Written so that errors that are not numbers count as far away.
     seen = evidence.p_value_left < LEVEL and not evidence.near <= NEAR
-    left = seen or not evidence.near <= FAR
+    left = seen or not (evidence.near <= FAR or evidence.explained >= NEARLY_ALL)
     if not evidence.named:
         if evidence.p_value >= LEVEL:
             return "nothing to add", (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lpvid.loop import VERDICTS
-from lpvid.loop._verdict import EXPLAINED, LEVEL, NEAR, Evidence, decide, explained
+from lpvid.loop._verdict import EXPLAINED, LEVEL, NEAR, NEARLY_ALL, Evidence, decide, explained
 
 NO, YES = 0.5, 0.5 * LEVEL
 CLOSE, FAR = 1.0, 2.0 * NEAR
@@ -20,6 +20,8 @@ CLOSE, FAR = 1.0, 2.0 * NEAR
         # Named: nothing left, too little left to matter, something left, seen by a test or not.
         (YES, NO, True, CLOSE, 0.99, "named"),
         (YES, NO, True, FAR, 0.99, "named, remainder unknown"),
+        (YES, NO, True, FAR, NEARLY_ALL, "named"),
+        (YES, YES, True, FAR, NEARLY_ALL, "named, remainder unknown"),
         (YES, YES, True, CLOSE, 0.99, "named"),
         (YES, YES, True, FAR, EXPLAINED, "named, remainder unknown"),
         (YES, YES, True, FAR, 0.5 * EXPLAINED, "abstain"),
