@@ -28,14 +28,8 @@ import scipy.signal
 from tqdm import tqdm
 
 from lpvid.data import IOData
-from lpvid.effects import LIBRARY, AbstractLaw, at, law
-from lpvid.loop import AbstractPortedStructure, Loop, close_the_loop
-from lpvid.loop._assess import free_run
-from lpvid.loop._candidates import places_of, port_name, slots_of
-from lpvid.loop._program import Setting
-from lpvid.loop._records import records_of, schedule_names, scheduling_nodes
-from lpvid.loop._search import run
-from lpvid.loop._tune import Fitted, empty_unknowns
+from lpvid.effects import AbstractLaw, at, law
+from lpvid.loop import FoundEffect, Loop, LoopModel, close_the_loop
 from lpvid.loop.structures import BlackBox, Servo
 from lpvid.report import text_table
 
@@ -71,63 +65,6 @@ def held(u: np.ndarray, y: np.ndarray, factor: int) -> tuple[np.ndarray, np.ndar
     """
     steps = len(u) // factor
     return u[: steps * factor].reshape(steps, factor).mean(axis=1), y[: steps * factor : factor]
-
-
-def model_of(structure: AbstractPortedStructure, loop: Loop, data: IOData) -> Fitted:
-    """The model with its effects as the library's predictor takes it, without a gain."""
-    schedules = schedule_names(data)
-    every = places_of(structure, LIBRARY, schedules)
-    named = {(LIBRARY[p.law].name, port_name(structure, p, schedules)): p for p in every}
-    places = [named[effect.name, effect.port] for effect in loop.effects]
-    theta = np.array([number.value for number in loop.parameters])
-    ports = structure.ports(jnp.asarray(theta), jnp.zeros(0))
-    states, directions = ports.A.shape[0], ports.force.shape[2]
-    unknowns = empty_unknowns(theta, states, len(data.lengths), directions)
-    amplitude, shape = np.array(unknowns.amplitude), np.array(unknowns.shape)
-    for slot, (effect, place) in enumerate(zip(loop.effects, places, strict=True)):
-        own, along = LIBRARY[place.law], directions if place.port == "force" else 1
-        values = [number.value for number in effect.parameters]
-        count = 0 if own.whole else len(own.amplitudes) * along
-        amplitude[slot, 0, 0] = 1.0
-        if count:
-            amplitude[slot, : len(own.amplitudes), :along] = np.reshape(values[:count], (-1, along))
-        shape[slot, : len(own.shapes)] = values[count:]
-    unknowns = type(unknowns)(
-        unknowns.theta, jnp.asarray(amplitude), jnp.asarray(shape), unknowns.start
-    )
-    varying = any(place.port == "parameter" for place in places)
-    setting = Setting(structure, LIBRARY, data.dt, varying)
-    gain = jnp.zeros((1, states, data.ny))
-    slots = slots_of(structure, places, len(schedules))
-    nothing = {"scales": (), "ratio": 0.0, "noise": np.ones(data.ny), "searched": None}
-    return Fitted(setting, tuple(places), slots=slots, unknowns=unknowns, gain=gain, **nothing)
-
-
-def simulated(structure: AbstractPortedStructure, loop: Loop, data: IOData) -> np.ndarray:
-    """Simulation (time, ny) of other records, only their initial states fitted."""
-    return free_run(model_of(structure, loop, data), _records(data))
-
-
-def windowed(
-    structure: AbstractPortedStructure, loop: Loop, data: IOData, starts: np.ndarray
-) -> np.ndarray:
-    """Simulation of records from given states (record, state)."""
-    model = model_of(structure, loop, data)
-    unknowns = model.unknowns
-    unknowns = type(unknowns)(
-        unknowns.theta, unknowns.amplitude, unknowns.shape, jnp.asarray(starts)
-    )
-    out = run(model.setting, _records(data), model.slots, unknowns, model.gain)
-    return np.asarray(data.y) - np.asarray(out.innovations)
-
-
-def _records(data: IOData):
-    return records_of(data, scheduling_nodes(data), data.dt * max(data.lengths), 0.0)
-
-
-def both(structure: AbstractPortedStructure, data: IOData, **options) -> tuple[Loop, Loop]:
-    """The linear model alone, and what close_the_loop makes of it."""
-    return close_the_loop(structure, data, laws=()), close_the_loop(structure, data, **options)
 
 
 def rms(error: np.ndarray) -> float:
@@ -173,13 +110,15 @@ def emps_motion(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return velocity, np.gradient(velocity, 1e-3)
 
 
-def emps_force_error(loop: Loop, force: np.ndarray, position: np.ndarray) -> float:
+def emps_force_error(
+    model: LoopModel, effects: Sequence[FoundEffect], force: np.ndarray, position: np.ndarray
+) -> float:
     """Relative force error of the inverse model in percent."""
     velocity, acceleration = emps_motion(position)
-    inertia, viscous = (number.value for number in loop.parameters)
+    inertia, viscous = model.parameters
     asked = inertia * acceleration + viscous * velocity
     along = (position, velocity, acceleration, force, 1e-3 * np.arange(len(force)))
-    for effect in loop.effects:
+    for effect in effects:
         own = law(effect.name)
         if own.memory or own.whole or "output" in effect.port:
             raise ValueError(f"{effect.name}: no inverse model is written for it.")
@@ -203,34 +142,36 @@ def _regressors(own: AbstractLaw, shape: jax.Array, along) -> np.ndarray:
     return np.asarray(jax.vmap(terms)(*map(jnp.asarray, along)))
 
 
-def emps_position_error(
-    structure: AbstractPortedStructure, loop: Loop, force: np.ndarray, position: np.ndarray
-) -> float:
+def emps_position_error(model: LoopModel, force: np.ndarray, position: np.ndarray) -> float:
     """RMS position error in mm over windows of 1 s, each from the measured state."""
     velocity, _ = emps_motion(position)
     begins = np.arange(0, len(position) - 1000, 1000)
-    cut = [slice(begin, begin + 1000) for begin in begins]
-    data = emps_data([force[one] for one in cut], [position[one] for one in cut], 1e-3)
+    thinned = [held(force[at : at + 1000], position[at : at + 1000], EMPS_THINNED) for at in begins]
+    forces, positions = zip(*thinned, strict=True)
+    data = emps_data(forces, positions, 1e-3 * EMPS_THINNED)
     starts = np.stack([position[begins], velocity[begins]], axis=1)
-    return 1e3 * rms(np.asarray(data.y) - windowed(structure, loop, data, starts))
+    return 1e3 * rms(np.asarray(data.y) - model.simulate(data, initial_states=starts))
 
 
 def emps(folder: Path) -> Outcome:
-    """Thinned to 10 ms for the search: motion is slower than 5 Hz; errors are at 1 ms."""
+    """Thinned to 10 ms: motion is slower than 5 Hz. The force error is that at 1 ms."""
     force, position = emps_file(folder, "DATA_EMPS.mat")
     thin = held(force, position, EMPS_THINNED)
     data = emps_data([thin[0]], [thin[1]], 1e-3 * EMPS_THINNED)
     structure = Servo(data)
-    linear, loop = both(structure, data)
+    loop = close_the_loop(structure, data)
     rows = []
     for name, file, force_known, position_known in (
         ("own file", "DATA_EMPS.mat", (3.11, None), (1.74, 0.46)),
         ("second file", "DATA_EMPS_PULSES.mat", (5.98, 2.6), (None, None)),
     ):
         record = emps_file(folder, file)
-        errors = [emps_force_error(one, *record) for one in (linear, loop)]
+        errors = [
+            emps_force_error(loop.model_before, (), *record),
+            emps_force_error(loop.model, loop.effects, *record),
+        ]
         rows.append(Row("EMPS", f"force, {name}, %", errors[0], errors[1], *force_known))
-        errors = [emps_position_error(structure, one, *record) for one in (linear, loop)]
+        errors = [emps_position_error(one, *record) for one in (loop.model_before, loop.model)]
         rows.append(
             Row("EMPS", f"position over 1 s, {name}, mm", errors[0], errors[1], *position_known)
         )
@@ -264,16 +205,12 @@ def silverbox(folder: Path) -> Outcome:
     data = silverbox_part(folder, first, first + SILVERBOX_SEARCHED)
     # The input is band-limited, not held: within a sample it moves, which feedthrough stands for.
     structure = BlackBox(data, order=2, feedthrough=True)
-    linear, loop = both(structure, data)
+    loop = close_the_loop(structure, data)
     rows = []
-    arrow = [
-        _silverbox_errors(structure, one, silverbox_part(folder, 100, 40576))
-        for one in (linear, loop)
-    ]
-    sines = [
-        _silverbox_errors(structure, one, silverbox_part(folder, test, end))
-        for one in (linear, loop)
-    ]
+    arrow, sines = (
+        [np.asarray(data.y) - one.simulate(data) for one in (loop.model_before, loop.model)]
+        for data in (silverbox_part(folder, 100, 40576), silverbox_part(folder, test, end))
+    )
     for metric, errors, published in (
         ("multisine, mV", [rms(one[SILVERBOX_SKIPPED:]) for one in sines], 0.36),
         ("arrow, mV", [rms(one[SILVERBOX_SKIPPED:]) for one in arrow], 0.26),
@@ -305,11 +242,11 @@ def quarter_drone(folder: Path) -> Outcome:
     # Before and after, the arm lies on its stop.
     data = drone_file(folder, "sinal4_multiseno_malha_fechada.csv")[_drone(16.0) : _drone(92.0)]
     structure = Servo(data)
-    linear, loop = both(structure, data)
+    loop = close_the_loop(structure, data)
     test = drone_file(folder, "sinal3_swept_sine_malha_fechada.csv")
     errors = [
-        float(np.rad2deg(rms(np.asarray(test.y) - simulated(structure, one, test))))
-        for one in (linear, loop)
+        float(np.rad2deg(rms(np.asarray(test.y) - one.simulate(test))))
+        for one in (loop.model_before, loop.model)
     ]
     return Outcome(
         loop, (Row("quarter drone", "swept sine, degrees", errors[0], errors[1], None, 3.0),), ""
@@ -325,10 +262,10 @@ def _daisy(folder: Path, file: str, channels: int, name: str) -> Outcome:
     whole = IOData(u=values[:, :channels], y=values[:, channels:], dt=1.0)
     data, test = whole.split(0.5)
     structure = BlackBox(data)
-    linear, loop = both(structure, data)
+    loop = close_the_loop(structure, data)
     size = np.asarray(test.y).std(axis=0)
     rows = []
-    errors = [np.asarray(test.y) - simulated(structure, one, test) for one in (linear, loop)]
+    errors = [np.asarray(test.y) - one.simulate(test) for one in (loop.model_before, loop.model)]
     for output in range(channels):
         shares = [100.0 * rms(one[:, output]) / float(size[output]) for one in errors]
         rows.append(Row(name, f"y{output + 1}, % of its spread", shares[0], shares[1], None, None))
@@ -358,8 +295,8 @@ def coupled_drives(folder: Path) -> Outcome:
         for part in (slice(0, 400), slice(400, 500))
     )
     structure = BlackBox(data, order=3)
-    linear, loop = both(structure, data)
-    errors = [np.asarray(test.y) - simulated(structure, one, test) for one in (linear, loop)]
+    loop = close_the_loop(structure, data)
+    errors = [np.asarray(test.y) - one.simulate(test) for one in (loop.model_before, loop.model)]
     rows = []
     for k, (name, published) in enumerate((("low", 0.096), ("high", 0.0945))):
         own = [rms(one[100 * k + 4 : 100 * (k + 1)]) for one in errors]

@@ -1,6 +1,8 @@
 """Close the loop with measured data: find the residual, trace it, add the effect, refit."""
 
 from lpvid.loop._engine import close_the_loop as close_the_loop
+from lpvid.loop._loop import Loop as Loop
+from lpvid.loop._loop_model import LoopModel as LoopModel
 from lpvid.loop._ported import AbstractPortedStructure as AbstractPortedStructure
 from lpvid.loop._ported import Labels as Labels
 from lpvid.loop._ported import Ports as Ports
@@ -10,7 +12,6 @@ from lpvid.loop._result import Errors as Errors
 from lpvid.loop._result import EstimatedNumber as EstimatedNumber
 from lpvid.loop._result import FoundEffect as FoundEffect
 from lpvid.loop._result import Ladder as Ladder
-from lpvid.loop._result import Loop as Loop
 from lpvid.loop._result import Series as Series
 from lpvid.loop._result import VirtualForce as VirtualForce
 from lpvid.loop.structures import STRUCTURES as STRUCTURES

@@ -16,6 +16,7 @@ class Bench:
         train: estimation records for the predictor.
         held_out: data that took no part.
         schedules: names of what a parameter may follow.
+        duration: s over which what follows time goes from −1 to 1.
         first_sample: of the held-out data in the record they come from.
     """
 
@@ -24,4 +25,5 @@ class Bench:
     train: Records
     held_out: Records
     schedules: tuple[str, ...]
+    duration: float
     first_sample: int

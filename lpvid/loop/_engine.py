@@ -14,10 +14,10 @@ from lpvid.loop._assess import noise_in
 from lpvid.loop._bench import Bench
 from lpvid.loop._checks import checked_options, checked_records
 from lpvid.loop._compare import better
+from lpvid.loop._loop import Loop
 from lpvid.loop._ported import AbstractPortedStructure
 from lpvid.loop._program import SLOTS, Setting
 from lpvid.loop._records import records_of, schedule_names, scheduling_nodes
-from lpvid.loop._result import Loop
 from lpvid.loop._rounds import (
     Chosen,
     Ranking,
@@ -136,6 +136,7 @@ def _bench(structure, data, test, split, laws) -> Bench:
         train=records_of(train, nodes, duration, 0.0, length),
         held_out=records_of(held_out, nodes, duration, start_time, length),
         schedules=schedule_names(data),
+        duration=duration,
         first_sample=first,
     )
 

@@ -14,12 +14,13 @@ from lpvid.loop._assess import (
 )
 from lpvid.loop._bench import Bench
 from lpvid.loop._candidates import Place, port_name
+from lpvid.loop._loop import Loop
+from lpvid.loop._loop_model import loop_model
 from lpvid.loop._result import (
     Candidate,
     EstimatedNumber,
     FoundEffect,
     Ladder,
-    Loop,
     Series,
 )
 from lpvid.loop._rounds import Chosen, Ranking, Rounds, held_out_errors, without
@@ -79,21 +80,22 @@ def summarise(
         errors["after"] = errors["before"]
     covariance = robust_covariance(fitted)
     ablation = {}
-    for slot, found in enumerate(chosen):
-        name = _label(bench, found.entry.trial.place)
+    for slot, one in enumerate(chosen):
+        name = _label(bench, one.entry.trial.place)
         ablation[name] = before.horizon
         if len(chosen) > 1:
             reduced = without(fitted, bench.train, slot)
             steps = ladder(reduced, bench.held_out, horizon)
             ablation[name] = np.sqrt(np.mean(steps**2, axis=0))
     structure = bench.setting.structure
+    nodes = np.asarray(bench.train.kappa_nodes)
     return Loop(
         verdict=verdict,
         advice=advice,
         structure=str(structure.name),
         parameters=_parameters(bench, fitted, covariance),
         effects=tuple(
-            _effect(bench, fitted, covariance, slot, found) for slot, found in enumerate(chosen)
+            _effect(bench, fitted, covariance, slot, one) for slot, one in enumerate(chosen)
         ),
         before=before,
         after=after,
@@ -117,6 +119,8 @@ def summarise(
             errors["before"],
             errors["after"],
         ),
+        model=loop_model(fitted, nodes, bench.duration),
+        model_before=loop_model(base, nodes, bench.duration),
         output_names=held_out.output_names,
         output_units=held_out.output_units,
         dt=held_out.dt,

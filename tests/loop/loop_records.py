@@ -144,6 +144,8 @@ def named(count=600, verdict="named"):
             ),
         ),
         series=series,
+        model=None,
+        model_before=None,
         output_names=("angle",),
         output_units=("rad",),
         dt=DT,

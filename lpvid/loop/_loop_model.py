@@ -1,0 +1,127 @@
+"""The model that a closed loop leaves behind: structure, parameters and effects, ready to use."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from lpvid.data import IOData
+from lpvid.loop._assess import free_run
+from lpvid.loop._ported import AbstractPortedStructure
+from lpvid.loop._program import Records
+from lpvid.loop._records import records_of
+from lpvid.loop._rounds import held_out_errors
+from lpvid.loop._search import run
+from lpvid.loop._tune import Fitted
+
+
+class LoopModel(NamedTuple):
+    """A structure with its parameters and effects, as `close_the_loop` found them.
+
+    Attributes:
+        fitted: everything estimated, and the predictor's gain.
+        nodes: of the scheduling that the gain is known at (node, nk).
+        duration: s over which what follows "time" goes from its first to its last value.
+
+    Example:
+        >>> from lpvid import IOData, close_the_loop
+        >>> u = np.repeat(np.random.default_rng(0).standard_normal(60), 10)
+        >>> y = np.zeros(600)
+        >>> for k in range(599):
+        ...     y[k + 1] = 0.9 * y[k] + 0.1 * u[k]
+        >>> noisy = y + 1e-3 * np.random.default_rng(1).standard_normal(600)
+        >>> data = IOData(u=u, y=noisy, dt=0.05)
+        >>> model = close_the_loop("black-box", data, laws=()).model
+        >>> bool(np.std(model.simulate(data)[:, 0] - y) < 5e-4)
+        True
+    """
+
+    fitted: Fitted
+    nodes: np.ndarray
+    duration: float
+
+    @property
+    def structure(self) -> AbstractPortedStructure:
+        """The structure, without its parameters."""
+        return self.fitted.setting.structure
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """ϑ (parameter,), in the order of `structure.parameter_names`."""
+        return np.asarray(self.fitted.unknowns.theta)
+
+    def simulate(
+        self, data: IOData, *, initial_states: Float[ArrayLike, "record state"] | None = None
+    ) -> np.ndarray:
+        """Response to the inputs of records, effects included; nothing measured is fed back.
+
+        Args:
+            data: records like those that the model was found on; their time starts at zero.
+            initial_states: of each record, in the structure's states; fitted to the records if
+                `None`.
+
+        Returns:
+            Outputs (time, ny), of one record after the other.
+
+        Raises:
+            ValueError: channels or sample time do not suit, or the states' shape is wrong.
+        """
+        records = self._records(data)
+        if initial_states is None:
+            return free_run(self.fitted, records)
+        starts = jnp.asarray(initial_states, float)
+        wanted = (len(data.lengths), self.fitted.unknowns.start.shape[1])
+        if starts.shape != wanted:
+            raise ValueError(
+                f"initial_states: {wanted} numbers are needed, one row for each record; got shape "
+                f"{starts.shape}."
+            )
+        unknowns = eqx.tree_at(lambda tree: tree.start, self.fitted.unknowns, starts)
+        none = jnp.zeros_like(self.fitted.gain)
+        out = run(self.fitted.setting, records, self.fitted.slots, unknowns, none)
+        return np.asarray(records.y - out.innovations)
+
+    def predict(self, data: IOData) -> np.ndarray:
+        """One-step predictions (time, ny), initial states fitted to the records.
+
+        Args:
+            data: records like those that the model was found on.
+
+        Raises:
+            ValueError: channels or sample time do not suit.
+        """
+        return np.asarray(data.y) - held_out_errors(self.fitted, self._records(data))
+
+    def _records(self, data: IOData) -> Records:
+        structure, dt = self.structure, self.fitted.setting.dt
+        channels = len(structure.input_names), len(structure.output_names)
+        if (data.nu, data.ny) != channels:
+            raise ValueError(
+                f"data: {channels[0]} inputs and {channels[1]} outputs are needed, got {data.nu} "
+                f"and {data.ny}."
+            )
+        if not np.isclose(data.dt, dt, rtol=1e-6):
+            raise ValueError(
+                f"data: the model holds its inputs over {dt} s, the records are sampled at "
+                f"{data.dt} s; resample them."
+            )
+        scheduling = 0 if data.kappa is None else np.asarray(data.kappa).shape[1]
+        if scheduling != self.nodes.shape[1]:
+            raise ValueError(
+                f"data: {self.nodes.shape[1]} scheduling signals are needed, got {scheduling}."
+            )
+        return records_of(data, self.nodes, self.duration, 0.0)
+
+
+def loop_model(fitted: Fitted, nodes: np.ndarray, duration: float) -> LoopModel:
+    """The model without the derivatives that only its search needed.
+
+    Args:
+        fitted: the model.
+        nodes: of the scheduling.
+        duration: s of the schedule "time".
+    """
+    searched = fitted.searched._replace(columns=np.zeros((0, 0, 0)))
+    return LoopModel(fitted._replace(searched=searched), nodes, duration)

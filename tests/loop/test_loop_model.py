@@ -1,0 +1,46 @@
+"""The model that a closed loop leaves behind, on records that took no part."""
+
+import numpy as np
+import pytest
+
+from lpvid.data import join
+
+from .engine_records import NOISE, closed, coulomb, record
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return closed(record(coulomb(0.4), seed=31))
+
+
+def test_it_simulates_and_predicts_other_records(loop):
+    other = record(coulomb(0.4), seed=32)
+    y = np.asarray(other.y)
+    free = [np.std(y - model.simulate(other)) for model in (loop.model_before, loop.model)]
+    steps = [np.std(y - model.predict(other)) for model in (loop.model_before, loop.model)]
+    assert steps[1] < 1.2 * NOISE < 1.5 * NOISE < steps[0]
+    assert free[1] < 1.5 * NOISE and free[1] < 0.2 * free[0]
+    np.testing.assert_array_equal(
+        loop.model.parameters, [number.value for number in loop.parameters]
+    )
+
+
+def test_several_records_are_simulated_one_after_the_other(loop):
+    records = [record(coulomb(0.4), seed=seed) for seed in (32, 33)]
+    starts = np.zeros((2, 2))
+    together = loop.model.simulate(join(records), initial_states=starts)
+    for part, one in zip(np.split(together, 2), records, strict=True):
+        alone = loop.model.simulate(one, initial_states=starts[:1])
+        np.testing.assert_allclose(part, alone, rtol=0.0, atol=1e-9)
+
+
+def test_records_of_another_kind_are_refused(loop):
+    other = record(coulomb(0.4), seed=32)
+    with pytest.raises(ValueError, match="resample"):
+        loop.model.simulate(other.replace(dt=2.0 * other.dt))
+    with pytest.raises(ValueError, match="inputs"):
+        loop.model.simulate(other.replace(u=np.concatenate([other.u, other.u], axis=1)))
+    with pytest.raises(ValueError, match="scheduling signals"):
+        loop.model.predict(other.replace(kappa=np.zeros(other.n_samples)))
+    with pytest.raises(ValueError, match="one row for each record"):
+        loop.model.simulate(other, initial_states=np.zeros((3, 2)))
