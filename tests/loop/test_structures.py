@@ -5,9 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 
 from lpvid.data import IOData, join
 from lpvid.loop.structures import STRUCTURES, FunctionPorted, Ports, structure_named
+from lpvid.loop.structures._regression import drive_sign
 from lpvid.mechanics import MassSpringDamper
 
 from .plants_in_loop import driven, mechanical
@@ -204,7 +206,31 @@ def test_faults_are_named():
     with pytest.raises(ValueError, match="order of its own"):
         structure_named("servo", one, order=3)
     with pytest.raises(ValueError, match="longer record"):
-        structure_named("servo", one[:20])
+        _started("servo", one[:20])
     arm = IOData(u=np.zeros((9, 2)), y=np.zeros((9, 2)), dt=0.1)
     with pytest.raises(ValueError, match="--schedule"):
         structure_named("two-link-arm", arm)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("rate", [False, True])
+@pytest.mark.parametrize("feedback", [0.0, 2.0])
+def test_the_drive_sign_of_a_resonant_arm(sign, rate, feedback):
+    # A light hub before a heavy resonance: short windows see no rigid body at all.
+    J, load, omega = 0.03, 0.8, 15.0
+    k, c = load * omega**2, 0.7
+    A = np.zeros((4, 4))
+    A[:2, 2:] = np.eye(2)
+    A[2] = np.array([-k, k, -c - 0.3, 0.3]) / J
+    A[3] = np.array([k, -k, 0.3, -0.3]) / load
+    generator = np.zeros((5, 5))
+    generator[:4, :4], generator[2, 4] = A, sign / J
+    step = scipy.linalg.expm(generator * 0.005)[:4]
+    rng = np.random.default_rng(5)
+    x, u, y = np.zeros(4), np.zeros(3000), np.zeros(3000)
+    wanted = np.repeat(rng.standard_normal(300), 10)
+    for t in range(3000):
+        y[t] = x[2 if rate else 0] + 1e-2 * rng.standard_normal()
+        u[t] = wanted[t] - sign * feedback * y[t]
+        x = step @ np.append(x, u[t])
+    assert drive_sign(IOData(u=u, y=y, dt=0.005), rate=rate) == sign

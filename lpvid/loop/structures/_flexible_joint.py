@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from lpvid.data import IOData
 from lpvid.loop._ported import AbstractPortedStructure, Labels, Ports
 from lpvid.loop.structures._channels import require_channels
-from lpvid.loop.structures._regression import least_squares, moments, rigid_body
+from lpvid.loop.structures._regression import drive_sign, least_squares, moments, rigid_body
 from lpvid.loop.structures._search import best_start, window_error
 from lpvid.loop.structures._units import per, times
 from lpvid.loop.structures._windows import Windows, windows_of
@@ -70,8 +70,7 @@ class FlexibleJoint(AbstractPortedStructure):
             coordinate_units=(position,) * 3,
             force_units=(force,) * 3,
         )
-        rigid = rigid_body(windows_of(data, 4), ny=data.ny)
-        self.sign = -1.0 if np.median(np.sign(rigid[:, 0])) < 0.0 else 1.0
+        self.sign = drive_sign(data)
 
     def ports(self, theta: Float[Array, " parameter"], kappa: Float[Array, " nk"]) -> Ports:
         """The matrices at θ = (J_m, J_l, k, d, c_m, c_l)."""

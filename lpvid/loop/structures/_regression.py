@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import Polynomial
 
+from lpvid.data import IOData
 from lpvid.loop.structures._windows import Windows
 
 # (1 − s²)³ vanishes with two derivatives at the window's ends; the factors make the means zero, so
@@ -64,8 +65,25 @@ def least_squares(
     return np.linalg.lstsq(regressors / size, target, rcond=None)[0] / size
 
 
+def drive_sign(data: IOData, *, rate: bool = False) -> float:
+    """Whether the input pushes the first output up (1) or down (−1): the work it does is positive.
+
+    A passive machine with any friction takes in energy on the whole, whatever resonances, gravity
+    or load it has; feedback from a noisy output only adds to that.
+
+    Args:
+        data: records of one input.
+        rate: whether the first output is a velocity.
+    """
+    work = 0.0
+    for record in data.records:
+        u, y = np.asarray(record.u)[:-1, 0], np.asarray(record.y)[:, 0]
+        work += float(u @ (y[1:] if rate else np.diff(y)))
+    return -1.0 if work < 0.0 else 1.0
+
+
 def rigid_body(
-    scales: Sequence[Windows], *, ny: int, rate: bool = False, spring: bool = False
+    scales: Sequence[Windows], *, ny: int, rate: bool = False
 ) -> Float[np.ndarray, "scale 2"]:
     """Inertia and viscous friction for one unit of input, by windows of each length.
 
@@ -73,7 +91,6 @@ def rigid_body(
         scales: windows of one input and `ny` outputs, of which the first counts.
         ny: number of outputs.
         rate: whether the output is a velocity.
-        spring: whether a load in proportion to the position is told apart and left out.
     """
     rows = []
     for windows in scales:
@@ -81,8 +98,5 @@ def rigid_body(
         above, below = known.accelerations, known.velocities
         if rate:
             above, below = known.velocities, known.positions
-        parts = [above[0], below[0]]
-        if spring and not rate:
-            parts.append(known.positions[0])
-        rows.append(least_squares(np.stack(parts, axis=1), known.inputs[0])[:2])
+        rows.append(least_squares(np.stack([above[0], below[0]], axis=1), known.inputs[0]))
     return np.array(rows)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from lpvid.data import IOData
 from lpvid.loop._ported import AbstractPortedStructure, Labels, Ports
 from lpvid.loop.structures._channels import require_channels
-from lpvid.loop.structures._regression import rigid_body
+from lpvid.loop.structures._regression import drive_sign, rigid_body
 from lpvid.loop.structures._search import best_start, window_error
 from lpvid.loop.structures._units import per, times
 from lpvid.loop.structures._windows import windows_of
@@ -64,9 +64,7 @@ class Servo(AbstractPortedStructure):
             coordinate_units=(position,),
             force_units=data.input_units,
         )
-        # Gravity must not decide on the sign.
-        rigid = rigid_body(windows_of(data, 2), ny=1, rate=output == "velocity", spring=True)
-        self.sign = -1.0 if np.median(np.sign(rigid[:, 0])) < 0.0 else 1.0
+        self.sign = drive_sign(data, rate=output == "velocity")
 
     def ports(self, theta: Float[Array, " parameter"], kappa: Float[Array, " nk"]) -> Ports:
         """The matrices at θ = (J, c)."""

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from lpvid.data import IOData
 from lpvid.loop._ported import AbstractPortedStructure, Labels, Ports
 from lpvid.loop.structures._channels import require_channels
-from lpvid.loop.structures._regression import least_squares, moments, rigid_body
+from lpvid.loop.structures._regression import drive_sign, least_squares, moments, rigid_body
 from lpvid.loop.structures._search import best_start, window_error
 from lpvid.loop.structures._units import per, times
 from lpvid.loop.structures._windows import Windows, windows_of
@@ -87,8 +87,7 @@ class FlexibleLink(AbstractPortedStructure):
             coordinate_units=(position,) * 2,
             force_units=(force,) * 2,
         )
-        rigid = rigid_body(windows_of(data, self._states), ny=data.ny)
-        self.sign = -1.0 if np.median(np.sign(rigid[:, 0])) < 0.0 else 1.0
+        self.sign = drive_sign(data)
 
     def ports(self, theta: Float[Array, " parameter"], kappa: Float[Array, " nk"]) -> Ports:
         """The matrices at θ: J, c, then ω, ζ, J_i of each mode, then the outputs' gains."""
