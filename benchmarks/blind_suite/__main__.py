@@ -47,13 +47,17 @@ def _answers(path: Path) -> dict[str, dict]:
 def run(jobs: list, path: Path, processes: int) -> None:
     """Solve what has no answer yet and append the answers, one line each."""
     done = _answers(path)
-    jobs = [job for job in jobs if job[0].key not in done]
+    # By plant, whose programs are compiled once.
+    jobs = sorted(
+        (job for job in jobs if job[0].key not in done), key=lambda job: job[0].key.rsplit("-", 1)
+    )
     if not jobs:
         return
     # Spawned: a process that has started JAX must not be forked.
     context = multiprocessing.get_context("spawn")
     with context.Pool(processes) as pool, path.open("a") as file:
-        for answer in tqdm(pool.imap_unordered(answer_job, jobs), total=len(jobs), unit="record"):
+        answers = pool.imap_unordered(answer_job, jobs)
+        for answer in tqdm(answers, total=len(jobs), unit="record"):
             file.write(json.dumps(answer) + "\n")
             file.flush()
 

@@ -70,6 +70,19 @@ def solve(record: Record, structure: str | None, told: list[str] | None = None) 
     }
 
 
+_last_plant = ""
+
+
 def answer_job(job: tuple) -> dict:
-    """`solve` of one tuple of its arguments."""
+    """`solve` of one tuple of its arguments.
+
+    Programs of another plant are let go of: a process has only so many pieces of memory.
+    """
+    global _last_plant
+    plant = job[0].key.rsplit("-", 1)[0]
+    if _last_plant and plant != _last_plant:
+        import jax
+
+        jax.clear_caches()
+    _last_plant = plant
     return solve(*job)

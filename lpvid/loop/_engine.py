@@ -18,6 +18,7 @@ from lpvid.loop._loop import Loop
 from lpvid.loop._ported import AbstractPortedStructure
 from lpvid.loop._program import SLOTS, Setting
 from lpvid.loop._records import records_of, schedule_names, scheduling_nodes
+from lpvid.loop._refit import without
 from lpvid.loop._rounds import (
     Chosen,
     Ranking,
@@ -26,7 +27,6 @@ from lpvid.loop._rounds import (
     held_out_errors,
     likelihood_on,
     rank,
-    without,
 )
 from lpvid.loop._summary import summarise
 from lpvid.loop._tune import RATIOS, Fitted, empty_unknowns, fit, refit, rough_noise
@@ -163,15 +163,17 @@ def _rounds(bench: Bench, base: Fitted, most: int, bar: tqdm) -> Rounds:
         if ranking.p_value > LEVEL:
             return Rounds(fitted, chosen, rankings, unfruitful)
         found = choose(fitted, ranking, bench.train, bench.held_out)
-        if found is None:
+        slower = max((one for one in RATIOS if one <= _SLOWER * fitted.ratio), default=None)
+        if found is None and slower is not None:
             bar.set_description(f"round {len(rankings)}, slow gain")
-            found, slow = _at_slow_gain(bench, fitted)
-            if found is None:
-                bar.update()
-                return Rounds(fitted, chosen, rankings, unfruitful + slow.tests)
-            unfruitful += ranking.tests
-            rankings[-1] = slow
+            found, slow = _at_slow_gain(bench, fitted, slower)
+            unfruitful += slow.tests
+            if found is not None:
+                rankings[-1] = slow
+                unfruitful += ranking.tests - slow.tests
         bar.update()
+        if found is None:
+            return Rounds(fitted, chosen, rankings, unfruitful)
         fitted = found.fitted
         chosen.append(found)
         if len(chosen) > 1:
@@ -180,15 +182,13 @@ def _rounds(bench: Bench, base: Fitted, most: int, bar: tqdm) -> Rounds:
     return Rounds(fitted, chosen, rankings, unfruitful)
 
 
-def _at_slow_gain(bench: Bench, fitted: Fitted) -> tuple[Chosen | None, Ranking]:
+def _at_slow_gain(bench: Bench, fitted: Fitted, ratio: float) -> tuple[Chosen | None, Ranking]:
     """A round with a predictor that follows its model for longer.
 
     Diffusion takes what the model lacks for noise, and the faster gain that comes of it swallows
     effects that act slowly. What is found is confirmed at the slow gain, then refitted with the
     diffusion free.
     """
-    wanted = _SLOWER * fitted.ratio
-    ratio = max((one for one in RATIOS if one <= wanted), default=RATIOS[0])
     slow = refit(fitted, bench.train, ratio, (ratio,))
     ranking = rank(slow, bench.train, bench.schedules)
     found = choose(slow, ranking, bench.train, bench.held_out)

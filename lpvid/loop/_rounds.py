@@ -3,19 +3,17 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from lpvid.effects import AbstractLaw
-from lpvid.loop._candidates import Place, Trial, places_of
-from lpvid.loop._columns import along, force_columns, scales_of, tests_at, trial_columns
+from lpvid.loop._candidates import Place, places_of
+from lpvid.loop._columns import along, force_columns, tests_at, trial_columns
 from lpvid.loop._compare import better, sample_likelihood
-from lpvid.loop._program import SLOTS, Records, Unknowns
-from lpvid.loop._score import Scored, ScoreTest, family_wise
+from lpvid.loop._program import Records
+from lpvid.loop._refit import Ranked, kept, with_effect
+from lpvid.loop._score import ScoreTest, family_wise
 from lpvid.loop._search import run
-from lpvid.loop._tune import Fitted, fit, with_starts
+from lpvid.loop._tune import Fitted, with_starts
 from lpvid.loop._verdict import LEVEL
 
 _ALIKE = 0.95
@@ -24,25 +22,6 @@ _ALIKE = 0.95
 _REFITTED, _ATTEMPTS = 3, 6
 _HOPEFUL = 0.3
 """Share of the best gain from which a candidate, its shape once free, could still win."""
-
-_REALISED = 0.5
-"""Share of the promised gain below which a refit counts as a failed search, not as evidence."""
-
-
-class Ranked(NamedTuple):
-    """One place with its best shape.
-
-    Attributes:
-        trial: place and shape.
-        scored: gain, amplitudes, p-value.
-        columns: sensitivities (time, ny, column).
-        penalised: gain less the complexity penalty.
-    """
-
-    trial: Trial
-    scored: Scored
-    columns: np.ndarray
-    penalised: float
 
 
 class Ranking(NamedTuple):
@@ -128,24 +107,6 @@ def _general(trace, test: ScoreTest) -> float:
     return family_wise(least, max(tests, 1))
 
 
-def _seated(unknowns: Unknowns, slot: int, entry: Ranked, whole: bool) -> Unknowns:
-    """The unknowns with a candidate in a slot."""
-    amplitude, shape = np.array(unknowns.amplitude), np.array(unknowns.shape)
-    amplitude[slot], shape[slot] = 0.0, 0.0
-    if whole:
-        amplitude[slot, 0, 0] = 1.0
-    else:
-        directions = amplitude.shape[2] if entry.trial.place.port == "force" else 1
-        values = entry.scored.amplitude.reshape(-1, directions)
-        amplitude[slot, : values.shape[0], :directions] = values
-    shape[slot, : entry.trial.shape.size] = entry.trial.shape
-    return eqx.tree_at(
-        lambda tree: (tree.amplitude, tree.shape),
-        unknowns,
-        (jnp.asarray(amplitude), jnp.asarray(shape)),
-    )
-
-
 def held_out_errors(fitted: Fitted, records: Records) -> np.ndarray:
     """One-step errors on other records, initial states fitted (time, ny).
 
@@ -198,111 +159,6 @@ class Rounds(NamedTuple):
     unfruitful: int
 
 
-def with_effect(fitted: Fitted, records: Records, entry: Ranked) -> Fitted:
-    """The model refitted with a candidate in its next slot.
-
-    Args:
-        fitted: the model as it stands.
-        records: estimation data.
-        entry: the candidate.
-    """
-    law, place = fitted.setting.laws[entry.trial.place.law], entry.trial.place
-    unknowns = _seated(fitted.unknowns, len(fitted.places), entry, law.whole)
-    if law.whole and law.shapes:
-        unknowns = _best_start(fitted, records, entry, unknowns)
-    model = fitted
-    for _ in range(2):
-        trace = along(model.setting, records, model.slots, model.unknowns, model.gain)
-        scales = (*fitted.scales, scales_of(trace, place))
-        model = fit(
-            fitted.setting,
-            records,
-            (*fitted.places, place),
-            scales,
-            unknowns,
-            fitted.noise,
-            ratio=model.ratio,
-            ratios=fitted.ratios,
-        )
-        if not _cramped(model, law):
-            break
-        # The better predictor sees its signals with less noise, which widens the bounds.
-        unknowns = model.unknowns
-    return model
-
-
-def _best_start(fitted: Fitted, records: Records, entry: Ranked, unknowns: Unknowns) -> Unknowns:
-    """Of several shapes of a law that replaces a signal, the one a few steps go furthest from.
-
-    The model's parameters have made up for it as well as they could, so its likelihood has minima
-    of its own: an amplitude of 2 at a delay of one sample means two samples or more.
-    """
-    slot, place = len(fitted.places), entry.trial.place
-    trace = along(fitted.setting, records, fitted.slots, fitted.unknowns, fitted.gain)
-    scales = (*fitted.scales, scales_of(trace, place))
-    lower, upper = fitted.setting.laws[place.law].bounds(scales[-1])
-    tried = []
-    for factor in (0.5, 1.0, 2.0, 4.0, 8.0):
-        shape = np.array(unknowns.shape)
-        own = entry.trial.shape * factor
-        shape[slot, : own.size] = np.clip(own, lower, upper)
-        start = eqx.tree_at(lambda tree: tree.shape, unknowns, jnp.asarray(shape))
-        tried.append(
-            fit(
-                fitted.setting,
-                records,
-                (*fitted.places, place),
-                scales,
-                start,
-                fitted.noise,
-                ratio=fitted.ratio,
-                ratios=fitted.ratios,
-                cycles=1,
-                steps=4,
-            )
-        )
-    return max(tried, key=lambda one: one.searched.log_likelihood).unknowns
-
-
-def _cramped(model: Fitted, law: AbstractLaw) -> bool:
-    """Whether a shape of the newest effect sits at its bound."""
-    if not law.shapes:
-        return False
-    lower, upper = law.bounds(model.scales[-1])
-    shape = np.asarray(model.unknowns.shape[len(model.places) - 1])[: len(law.shapes)]
-    return bool(np.any((shape <= 1.001 * lower) | (shape >= 0.999 * upper)))
-
-
-def without(fitted: Fitted, records: Records, slot: int) -> Fitted:
-    """The model refitted without one of its effects.
-
-    Args:
-        fitted: the model.
-        records: estimation data.
-        slot: which effect to leave out.
-    """
-    kept = [place for place in range(len(fitted.places)) if place != slot]
-    order = np.asarray([*kept, slot, *range(len(fitted.places), SLOTS)])
-    amplitude = np.array(fitted.unknowns.amplitude)[order]
-    shape = np.array(fitted.unknowns.shape)[order]
-    amplitude[len(kept) :], shape[len(kept) :] = 0.0, 0.0
-    unknowns = eqx.tree_at(
-        lambda tree: (tree.amplitude, tree.shape),
-        fitted.unknowns,
-        (jnp.asarray(amplitude), jnp.asarray(shape)),
-    )
-    return fit(
-        fitted.setting,
-        records,
-        [fitted.places[place] for place in kept],
-        [fitted.scales[place] for place in kept],
-        unknowns,
-        fitted.noise,
-        ratio=fitted.ratio,
-        ratios=fitted.ratios,
-    )
-
-
 def choose(fitted: Fitted, ranking: Ranking, records: Records, held_out: Records) -> Chosen | None:
     """Refit the best few and take the one that held-out data prefer, if they prefer any.
 
@@ -328,8 +184,7 @@ def choose(fitted: Fitted, ranking: Ranking, records: Records, held_out: Records
         if len(tried) == _REFITTED:
             break
         refitted = with_effect(fitted, records, entry)
-        realised = refitted.searched.log_likelihood - fitted.searched.log_likelihood
-        if realised < _REALISED * min(entry.scored.gain, 50.0):
+        if not kept(fitted, refitted, entry.scored.gain):
             continue
         errors = held_out_errors(refitted, held_out)
         tried.append((entry, refitted, likelihood_on(refitted, errors)))

@@ -26,6 +26,8 @@ COLUMNS = 24
 
 _DAMPING, _LESS, _MORE, _MOST = 1e-4, 0.2, 8.0, 1e8
 _RANK = 1e-12
+_FURTHEST = 1.5
+"""Longest step of the logarithm of a positive number."""
 
 
 @eqx.filter_jit
@@ -179,6 +181,20 @@ def _step(gram: np.ndarray, slope: np.ndarray, damping: float) -> np.ndarray:
     return -(vectors @ (inverse * (vectors.T @ (slope / scale)))) / scale
 
 
+def _moved(
+    point: np.ndarray, move: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A point moved, steps logarithmic where values are positive, and the step at first order."""
+    positive = lower > 0.0
+    size = np.where(positive, point, 1.0)
+    share = np.clip(np.where(positive, move / size, 0.0), -_FURTHEST, _FURTHEST)
+    wanted = np.where(positive, size * np.exp(share), point + move)
+    moved = np.clip(wanted, lower, upper)
+    taken = np.where(positive, size * share, move)
+    cut = moved != wanted
+    return moved, np.where(cut, moved - point, taken)
+
+
 def search(
     setting: Setting,
     records: Records,
@@ -236,15 +252,16 @@ def search(
         while damping <= _MOST:
             move[free] = _step(gram[np.ix_(free, free)], slope[free], damping)
             trial = best.copy()
-            trial[places] = np.clip(point + move, lower, upper)
-            taken = trial[places] - point
+            trial[places], taken = _moved(point, move, lower, upper)
             promised = -(slope @ taken + 0.5 * taken @ gram @ taken)
-            if promised < tolerance:
+            if promised < tolerance and np.array_equal(taken, move):
                 break
-            found = evaluate(trial)
-            if found[2] > reached:
-                damping, got = max(damping * _LESS, 1e-9), found
-                break
+            if promised >= tolerance:
+                found = evaluate(trial)
+                if found[2] > reached:
+                    damping, got = max(damping * _LESS, 1e-9), found
+                    break
+            # A step that bounds cut short points elsewhere: damping turns it along the slope.
             damping *= _MORE
         if got is None:
             converged = True

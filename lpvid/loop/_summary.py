@@ -16,6 +16,7 @@ from lpvid.loop._bench import Bench
 from lpvid.loop._candidates import Place, port_name
 from lpvid.loop._loop import Loop
 from lpvid.loop._loop_model import loop_model
+from lpvid.loop._refit import without
 from lpvid.loop._result import (
     Candidate,
     EstimatedNumber,
@@ -23,7 +24,7 @@ from lpvid.loop._result import (
     Ladder,
     Series,
 )
-from lpvid.loop._rounds import Chosen, Ranking, Rounds, held_out_errors, without
+from lpvid.loop._rounds import Chosen, Ranking, Rounds, held_out_errors
 from lpvid.loop._score import family_wise
 from lpvid.loop._tune import Fitted, free_unknowns
 from lpvid.loop._verdict import Evidence, decide, explained

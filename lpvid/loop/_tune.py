@@ -153,6 +153,7 @@ def fit(
     *,
     ratio: float = RATIOS[-2],
     ratios: tuple[float, ...] = RATIOS,
+    gain: Array | None = None,
     cycles: int = 8,
     steps: int = 12,
 ) -> Fitted:
@@ -167,6 +168,8 @@ def fit(
         noise: standard deviation of the outputs' noise (ny,).
         ratio: diffusion to start with.
         ratios: those to choose from.
+        gain: that the first cycle keeps, so that a larger model never starts behind a smaller
+            one; worked out from the parameters if `None`.
         cycles: how often diffusion and parameters take turns at most.
         steps: of each search.
     """
@@ -191,14 +194,16 @@ def fit(
         return neighbours[int(np.argmax(scored))]
 
     best: tuple[Searched, Array, float] | None = None
-    for _ in range(cycles):
-        gain = gain_of(unknowns, ratio)
+    for cycle in range(cycles):
+        if gain is None or cycle:
+            gain = gain_of(unknowns, ratio)
         found = search(setting, records, slots, unknowns, gain, where, lower, upper, steps=steps)
         reached = -np.inf if best is None else best[0].log_likelihood
         if best is None or found.log_likelihood > reached:
             best = found, gain, ratio
         following = choose(found.unknowns, ratio) if len(ratios) > 1 else ratio
-        if following == ratio or found.log_likelihood < reached + _WORTH:
+        settled = following == ratio and found.converged
+        if settled or found.log_likelihood < reached + _WORTH:
             break
         unknowns, ratio = found.unknowns, following
     assert best is not None

@@ -78,7 +78,8 @@ def drive_sign(data: IOData, *, rate: bool = False) -> float:
     work = 0.0
     for record in data.records:
         u, y = np.asarray(record.u)[:-1, 0], np.asarray(record.y)[:, 0]
-        work += float(u @ (y[1:] if rate else np.diff(y)))
+        # A constant input holds a load; what it lifts on the whole says nothing of the drive.
+        work += float((u - u.mean()) @ (y[1:] if rate else np.diff(y)))
     return -1.0 if work < 0.0 else 1.0
 
 
