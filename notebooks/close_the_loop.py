@@ -93,9 +93,10 @@ for effect in found.effects:
 # ## A measured drive
 # The electro-mechanical positioning system EMPS (Janot, Gautier and Brunot, 2019): a carriage on a
 # ball screw, its force in, its position out, under position control. Its authors name dry friction
-# and viscous friction that differs by direction; nobody tells the engine. The record is not part of
-# the repository: `LPVID_DATA` names the folder. It is thinned to 10 ms, each new sample's force
-# the mean of those it holds.
+# and viscous friction that differs by direction; nobody tells the engine. The second is found at a
+# slow gain: the likeliest predictor corrects itself so fast that a slow effect hardly shows. The
+# record is not part of the repository: `LPVID_DATA` names the folder. It is thinned to 10 ms, each
+# new sample's force the mean of those it holds.
 
 # %%
 file = Path(os.environ.get("LPVID_DATA", "../../shared/data")) / "emps" / "DATA_EMPS.mat"
