@@ -2,6 +2,7 @@
 
 import time
 import traceback
+from pathlib import Path
 
 import numpy as np
 
@@ -70,19 +71,16 @@ def solve(record: Record, structure: str | None, told: list[str] | None = None) 
     }
 
 
-_last_plant = ""
+_MOST_MAPS = 30_000
+"""Pieces of memory from which compiled programs are let go of; Linux gives a process 65 530."""
 
 
 def answer_job(job: tuple) -> dict:
-    """`solve` of one tuple of its arguments.
-
-    Programs of another plant are let go of: a process has only so many pieces of memory.
-    """
-    global _last_plant
-    plant = job[0].key.rsplit("-", 1)[0]
-    if _last_plant and plant != _last_plant:
+    """`solve` of one tuple of its arguments."""
+    answer = solve(*job)
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_text().splitlines()) > _MOST_MAPS:
         import jax
 
         jax.clear_caches()
-    _last_plant = plant
-    return solve(*job)
+    return answer
