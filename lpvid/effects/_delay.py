@@ -14,7 +14,7 @@ class InputDelay(AbstractStaticLaw):
     """u(t) → u(t − d): adds u(t − d) − u(t), d of whole and broken samples.
 
     Of an input held over the sample, a delay of m + f samples passes u_{k−m−1} for f of the sample
-    and u_{k−m} for the rest; the regressor is their mean.
+    and u_{k−m} for the rest; the regressor is their mean over the step that is taken.
 
     Seen as: phase −ω d at a flat gain. Confused with an actuator lag (gain rolls off), a missing
     fast mode.
@@ -41,9 +41,14 @@ class InputDelay(AbstractStaticLaw):
     ) -> Float[Array, " amplitude"]:
         """u(t − d) − u(t)."""
         del memory
-        samples = shape[0] / jnp.maximum(signals.sample, LEAST_WIDTH)
-        samples = jnp.clip(samples, 0.0, HISTORY - 1.0)
-        weights = jnp.maximum(1.0 - jnp.abs(samples - jnp.arange(HISTORY, dtype=float)), 0.0)
+        sample = jnp.maximum(signals.sample, LEAST_WIDTH)
+        samples = jnp.clip(shape[0] / sample, 0.0, HISTORY - 1.0)
+        width = jnp.clip(signals.step / sample, LEAST_WIDTH, 1.0)
+        # The step as it was sent; entry i of the history was held from i samples ago on.
+        begin = jnp.clip(signals.step_start / sample, 0.0, 1.0 - width) - samples
+        held = -jnp.arange(HISTORY, dtype=float)
+        shared = jnp.minimum(begin + width, held + 1.0) - jnp.maximum(begin, held)
+        weights = jnp.maximum(shared, 0.0) / width
         return jnp.stack([weights @ signals.history - signals.history[0]])
 
     def grid(self, scales: Scales) -> np.ndarray:

@@ -19,8 +19,8 @@ class PeriodicDisturbance(AbstractStaticLaw):
 
     Nothing is heard of it half a spectral line of the record away, so all `lines` count as tested,
     and `loudest` picks those worth a closer look from a residual's spectrum; `grid` thins them out
-    where there is no residual. It enters at an input: at a linear model's other ports the same
-    sinusoid would only have another amplitude and phase.
+    where there is no residual. With one output every port is alike but for amplitude and phase;
+    several outputs tell them apart.
 
     Seen as: one spectral line that the input does not excite. Confused with torque ripple (follows
     the angle) and a missing mode (follows the input).
@@ -35,7 +35,7 @@ class PeriodicDisturbance(AbstractStaticLaw):
 
     name: ClassVar[str] = "periodic-disturbance"
     family: ClassVar[str] = "disturbance"
-    ports: ClassVar[tuple[str, ...]] = ("input",)
+    ports: ClassVar[tuple[str, ...]] = ("input", "force")
     amplitudes: ClassVar[tuple[Amplitude, ...]] = (
         Amplitude("A", "{acts_on}"),
         Amplitude("B", "{acts_on}"),

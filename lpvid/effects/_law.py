@@ -43,6 +43,8 @@ class Signals(eqx.Module):
         time: s since the record's start.
         history: u at the port, the present sample first (13,).
         sample: time from one sample of the history to the next, s.
+        step_start: s from the sample's start to that of the step a law is read along.
+        step: length of that step, s.
     """
 
     position: Float[Array, "*path"]
@@ -54,6 +56,8 @@ class Signals(eqx.Module):
     time: Float[Array, "*path"]
     history: Float[Array, "*path lag"]
     sample: Float[Array, "*path"]
+    step_start: Float[Array, "*path"]
+    step: Float[Array, "*path"]
 
 
 class Size(NamedTuple):
@@ -253,6 +257,8 @@ def at(
     time: ArrayLike = 0.0,
     history: ArrayLike | None = None,
     sample: ArrayLike = 1.0,
+    step_start: ArrayLike = 0.0,
+    step: ArrayLike | None = None,
 ) -> Signals:
     """Signals at one instant, zero unless given: to try a law by hand.
 
@@ -266,6 +272,8 @@ def at(
         time: s.
         history: u at the port, the present sample first (13,); `input` all along by default.
         sample: s between samples.
+        step_start: s since the sample's start.
+        step: s; the whole sample by default.
 
     Example:
         >>> at(velocity=2.0).velocity
@@ -283,4 +291,6 @@ def at(
         time=jnp.asarray(time, float),
         history=past,
         sample=jnp.asarray(sample, float),
+        step_start=jnp.asarray(step_start, float),
+        step=jnp.asarray(sample if step is None else step, float),
     )

@@ -214,6 +214,8 @@ def signals_at(
         "time": np.asarray(records.time),
         "history": history[:, :, place.where] if at_input else np.zeros((count, HISTORY)),
         "sample": np.full(count, dt),
+        "step_start": nothing,
+        "step": np.full(count, dt),
     }
     return Signals(**{name: jnp.asarray(leaf) for name, leaf in leaves.items()})
 

@@ -217,7 +217,7 @@ def trace(
             states @ M.C.T + still @ M.D.T,
         )
 
-    def contributions(M: Sampled, begin, end, memory, u, history, time):
+    def contributions(M: Sampled, begin, end, memory, u, history, time, since):
         """What the effects add on the way (fraction, drive), to outputs (ny,), their memory."""
         shares = jnp.asarray(FRACTIONS)[:, None]
         path = read(M, (1.0 - shares) * begin[None] + shares * end[None], u)
@@ -237,6 +237,8 @@ def trace(
                 time=times,
                 history=still[:, None] * (history @ slots.input[slot])[None],
                 sample=setting.dt * still,
+                step_start=since * still,
+                step=fine * still,
             )
 
         def one(slot, evaluate, so_far):
@@ -270,7 +272,7 @@ def trace(
 
     def step(carry, fraction):
         x, memory, drive = carry
-        u, y, history, time, weight, kappa_weight, first, which, sees, ends, added = fraction
+        u, y, history, time, since, weight, kappa_weight, first, which, sees, ends, added = fraction
         M = _at(matrices, weight)
         L = jnp.tensordot(kappa_weight, gain, axes=1)
         x = jnp.where(first > 0.0, unknowns.start[which], x)
@@ -280,7 +282,7 @@ def trace(
         # Laws are read on the way that the model takes by itself, with the last forces.
         free = M.transition @ x + M.drive @ held
         along, sensed, following = contributions(
-            M, x, free + M.drive @ drive, memory, u, history, time
+            M, x, free + M.drive @ drive, memory, u, history, time, since
         )
         level, change = moments(along)
         error = sees * (y - (M.C @ x + M.D @ (u + level[:nu]) + sensed + added.output))
@@ -298,6 +300,7 @@ def trace(
     fractions = (
         *map(spread, (records.u, records.y, records.history)),
         spread(records.time) + fine * place,
+        fine * place,
         *map(spread, (node_weights, records.weights)),
         jnp.where(place == 0.0, spread(records.first), 0.0),
         spread(records.record),

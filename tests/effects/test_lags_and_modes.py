@@ -58,6 +58,15 @@ def test_delay_is_the_mean_of_the_delayed_staircase():
         sent = np.ceil((samples * DT - inside) / DT - 1e-12).astype(int)
         expected = history[np.maximum(sent, 0)].mean()
         assert_allclose(history[0] + run(jnp.array([samples * DT])), expected, rtol=1e-9)
+        quarters = [
+            at(input=history[0], history=history, sample=DT, step_start=k * DT / 4, step=DT / 4)
+            for k in range(4)
+        ]
+        shape = jnp.array([samples * DT])
+        each = [float(one.regressors(part, shape, jnp.zeros(2))[0]) for part in quarters]
+        for part, inside_it in zip(each, np.split(sent, 4), strict=True):
+            own = history[np.maximum(inside_it, 0)].mean()
+            assert_allclose(history[0] + part, own, rtol=1e-9)
     assert float(one.regressors(at(input=1.0), jnp.array([0.1]), jnp.zeros(2))[0]) == 0.0
 
 

@@ -11,7 +11,18 @@ from numpy.testing import assert_allclose
 from lpvid.effects import HISTORY, LIBRARY, MEMORY, Signals, at, law
 
 NAMES = [one.name for one in LIBRARY]
-SCALARS = ("position", "velocity", "acceleration", "load", "input", "output", "time", "sample")
+SCALARS = (
+    "position",
+    "velocity",
+    "acceleration",
+    "load",
+    "input",
+    "output",
+    "time",
+    "sample",
+    "step_start",
+    "step",
+)
 
 
 def unpack(vector):
