@@ -1,10 +1,12 @@
 """Disturbances that follow the clock."""
 
+from collections.abc import Callable
 from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
+import scipy.optimize
 from jaxtyping import Array, Float
 
 from lpvid.effects._law import AbstractStaticLaw, Amplitude, Scales, Shape, Signals
@@ -17,10 +19,10 @@ _GROUND = 25
 class PeriodicDisturbance(AbstractStaticLaw):
     """A sinusoid in time, A sin ωt + B cos ωt: a rotor out of balance, the mains.
 
-    Nothing is heard of it half a spectral line of the record away, so all `lines` count as tested,
-    and `loudest` picks those worth a closer look from a residual's spectrum; `grid` thins them out
-    where there is no residual. With one output every port is alike but for amplitude and phase;
-    several outputs tell them apart.
+    Little is heard of it a fraction of a spectral line away, so `loudest` looks for the peaks of a
+    residual's spectrum, between the lines too, and several frequencies for each of the `lines`
+    count as tested; `grid` thins the lines out where there is no residual. With one output every
+    port is alike but for amplitude and phase; several outputs tell them apart.
 
     Seen as: one spectral line that the input does not excite. Confused with torque ripple (follows
     the angle) and a missing mode (follows the input).
@@ -67,7 +69,7 @@ class PeriodicDisturbance(AbstractStaticLaw):
         return lines[np.unique(chosen)][:, None]
 
     def loudest(self, residual: np.ndarray, scales: Scales) -> np.ndarray:
-        """The lines that stand out of a residual's spectrum most, (candidate, 1).
+        """Frequencies that stand out of a residual's spectrum most, (candidate, 1).
 
         Args:
             residual: (time, ny).
@@ -80,7 +82,18 @@ class PeriodicDisturbance(AbstractStaticLaw):
         # What the noise's colour or another effect puts into a whole band is not a line.
         ground = scipy.ndimage.median_filter(total, size=_GROUND, mode="nearest")
         contrast = total / np.maximum(ground, 1e-300)
-        return lines[np.argsort(-contrast)[:_LOUDEST]][:, None]
+        picked = lines[np.argsort(-contrast)[:_LOUDEST]]
+        time = scales.dt * np.arange(residual.shape[0])
+        whole = residual / np.std(residual, axis=0)
+        # A strong line a tenth of the lines' distance off leaves most of itself behind.
+        apart = 2.0 * np.pi / scales.duration
+
+        def power_at(omega: float) -> float:
+            return float(np.sum(np.abs(np.exp(-1j * omega * time) @ whole) ** 2))
+
+        found = [_peak(power_at, max(one - apart, 0.5 * apart), one + apart) for one in picked]
+        lower, upper = self.bounds(scales)
+        return np.clip(np.asarray(found), lower[0], upper[0])[:, None]
 
     def bounds(self, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
         """From one period in the record to 0.95 of Nyquist's frequency."""
@@ -88,3 +101,10 @@ class PeriodicDisturbance(AbstractStaticLaw):
             np.array([2.0 * np.pi / scales.duration]),
             np.array([max(0.95 * np.pi / scales.dt, 8.0 * np.pi / scales.duration)]),
         )
+
+
+def _peak(power: Callable[[float], float], low: float, high: float) -> float:
+    """Where the power is greatest between two frequencies."""
+    near = 1e-3 * (high - low)
+    best = scipy.optimize.fminbound(lambda omega: -power(omega), low, high, xtol=near)
+    return float(np.asarray(best))

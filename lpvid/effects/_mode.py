@@ -52,17 +52,18 @@ class MissingMode(AbstractLaw):
         memory: Float[Array, " memory"],
         dt: Float[Array, ""],
     ) -> Float[Array, " memory"]:
-        """r and ż one step later, exactly for a held acceleration."""
+        """r and ż after dt, exactly for a held acceleration; signals are the step's middle's."""
         omega, zeta = jnp.maximum(shape[0], 1e-6), shape[1]
         damped = omega * jnp.sqrt(jnp.maximum(1.0 - zeta**2, 1e-6))
         decay = jnp.exp(-zeta * omega * dt)
         cosine, sine = decay * jnp.cos(damped * dt), decay * jnp.sin(damped * dt) * omega / damped
         # About the place where the spring carries the acceleration, it swings freely.
         sag = signals.acceleration / omega**2
-        r, rate = memory[0] + sag, memory[1] - signals.velocity
+        velocity = signals.velocity - 0.5 * signals.acceleration * signals.step
+        r, rate = memory[0] + sag, memory[1] - velocity
         r_next = r * (cosine + zeta * sine) + rate / omega * sine - sag
         rate_next = rate * (cosine - zeta * sine) - r * omega * sine
-        velocity_next = signals.velocity + signals.acceleration * dt
+        velocity_next = velocity + signals.acceleration * dt
         return memory.at[:2].set(jnp.stack([r_next, rate_next + velocity_next]))
 
     def grid(self, scales: Scales) -> np.ndarray:

@@ -6,6 +6,7 @@ import numpy as np
 import scipy.signal
 
 from lpvid.analysis import bft
+from lpvid.data import IOData
 from lpvid.loop._compare import whitener, window
 from lpvid.loop._program import Records
 from lpvid.loop._result import Errors
@@ -21,6 +22,15 @@ _HIGH = 0.6
 
 def _rms(errors: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(errors**2, axis=0))
+
+
+def default_horizon(data: IOData) -> int:
+    """A twentieth of the shortest record, 5 to 200 samples.
+
+    Args:
+        data: held-out records.
+    """
+    return int(np.clip(min(data.lengths) // 20, 5, 200))
 
 
 def free_run(fitted: Fitted, records: Records) -> np.ndarray:

@@ -10,17 +10,22 @@ _LEAST_SAMPLES = 100
 _LEAST_HELD_OUT = 50
 
 
-def checked_options(test: IOData | None, split: float, most_effects: int) -> None:
+def checked_options(
+    test: IOData | None, split: float, most_effects: int, horizon: int | None
+) -> None:
     """Refuse choices that leave nothing to do.
 
     Args:
         test: other records, if any.
         split: share that estimates.
         most_effects: effects to add at most.
+        horizon: samples of the horizon error, if given.
 
     Raises:
-        ValueError: an unusable split or number of effects.
+        ValueError: an unusable split, number of effects or horizon.
     """
+    if horizon is not None and horizon < 1:
+        raise ValueError(f"horizon={horizon} must be a number of samples, 1 or more.")
     if not 1 <= most_effects <= SLOTS:
         raise ValueError(f"most_effects={most_effects} must be 1 to {SLOTS}.")
     if test is None and not 0.2 <= split <= 0.9:
@@ -31,7 +36,11 @@ def checked_options(test: IOData | None, split: float, most_effects: int) -> Non
 
 
 def checked_records(
-    structure: AbstractPortedStructure, data: IOData, test: IOData | None, split: float
+    structure: AbstractPortedStructure,
+    data: IOData,
+    test: IOData | None,
+    split: float,
+    horizon: int | None,
 ) -> None:
     """Refuse records that cannot give an answer, with the reason and the remedy.
 
@@ -40,6 +49,7 @@ def checked_records(
         data: records.
         test: other records, if any.
         split: share that estimates.
+        horizon: samples of the horizon error, if given.
 
     Raises:
         DataError: non-finite, constant or too short signals, or ones that do not fit.
@@ -53,17 +63,18 @@ def checked_records(
         )
     if test is not None and (test.kappa is None) != (data.kappa is None):
         raise DataError("Either both of data and test need a scheduling signal or neither.")
-    if test is not None and len(test.lengths) != len(data.lengths):
-        raise DataError(
-            f"test has {len(test.lengths)} records and data {len(data.lengths)}: give as many."
-        )
     shortest = min(data.lengths)
-    estimate = shortest if test is not None else int(shortest * split)
+    estimate = shortest if test is not None else round(shortest * split)
     decide = min(test.lengths) if test is not None else shortest - estimate
     if estimate < _LEAST_SAMPLES or decide < _LEAST_HELD_OUT:
         raise DataError(
             f"Records of {estimate} samples to estimate and {decide} to decide are too short: "
             f"give at least {_LEAST_SAMPLES} and {_LEAST_HELD_OUT}."
+        )
+    if horizon is not None and 2 * horizon > decide:
+        raise DataError(
+            f"horizon={horizon} is more than half of a held-out record of {decide} samples: give a "
+            "shorter one, or more data."
         )
 
 

@@ -15,6 +15,9 @@ from lpvid.loop._discretise import Sampled, sampled_at
 from lpvid.loop._program import Injection, Records, Setting, Slots, Unknowns, node_matrices
 from lpvid.loop._search import COLUMNS, injected, run
 
+_BETWEEN = 4
+"""Frequencies that count as tested for each spectral line of a record."""
+
 Signal = tuple[np.ndarray, np.ndarray]
 """What is added to the state (time, state) and to the output (time, ny)."""
 
@@ -239,8 +242,13 @@ def scales_of(trace: Along, place: Place) -> Scales:
         trace: whose signals set the scales.
         place: where and which law.
     """
+    # What only pads the record to its length says nothing of sizes.
+    count = int(np.sum(np.asarray(trace.records.counts)))
     own, before = (
-        signals_at(trace.signals[name], trace.records, place, trace.setting.dt)
+        jax.tree.map(
+            lambda leaf: leaf[:count],
+            signals_at(trace.signals[name], trace.records, place, trace.setting.dt),
+        )
         for name in ("start", "before")
     )
     return scales_at(own, before, trace.setting.dt)
@@ -269,6 +277,6 @@ def tests_at(trace: Along, place: Place, tried: int) -> int:
     """
     law = trace.setting.laws[place.law]
     if isinstance(law, PeriodicDisturbance):
-        # Picked from the residual's own spectrum: every line was looked at.
-        return law.lines(scales_of(trace, place)).size
+        # Picked from the residual's own spectrum: every line was looked at, and between them.
+        return _BETWEEN * law.lines(scales_of(trace, place)).size
     return tried

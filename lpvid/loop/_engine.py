@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from lpvid.data import IOData
 from lpvid.effects import LIBRARY, AbstractLaw
-from lpvid.loop._assess import noise_in
+from lpvid.loop._assess import default_horizon, ladder, noise_in
 from lpvid.loop._bench import Bench
 from lpvid.loop._checks import checked_options, checked_records
 from lpvid.loop._compare import better
@@ -30,7 +30,7 @@ from lpvid.loop._rounds import (
 )
 from lpvid.loop._summary import summarise
 from lpvid.loop._tune import RATIOS, Fitted, empty_unknowns, fit, refit, rough_noise
-from lpvid.loop._verdict import LEVEL
+from lpvid.loop._verdict import LEVEL, NEAR
 from lpvid.loop.structures import PortedModel, structure_named
 
 _SLOWER = 1.001e-3
@@ -96,9 +96,9 @@ def close_the_loop(
         ('named', ['coulomb'])
     """
     begun = time.perf_counter()
-    checked_options(test, split, most_effects)
+    checked_options(test, split, most_effects, horizon)
     structure = _structure(model, data if test is not None else data.split(split)[0])
-    checked_records(structure, data, test, split)
+    checked_records(structure, data, test, split, horizon)
     bench = _bench(structure, data, test, split, tuple(laws))
     with tqdm(total=most_effects + 3, disable=not progress, desc="fitting") as bar:
         base = _base(bench)
@@ -122,19 +122,19 @@ def _structure(model: Any, train: IOData) -> AbstractPortedStructure:
 def _bench(structure, data, test, split, laws) -> Bench:
     if test is None:
         train, held_out = data.split(split)
-        first = int(data.lengths[0] * split)
+        starts = [data.dt * length for length in train.lengths]
+        first = train.lengths[0]
     else:
-        train, held_out, first = data, test, 0
+        train, held_out, starts, first = data, test, None, 0
     setting = Setting(structure, laws, train.dt)
     nodes = scheduling_nodes(data)
     duration = train.dt * (max(data.lengths) if test is None else max(train.lengths))
     length = max(train.n_samples, held_out.n_samples)
-    start_time = first * train.dt
     return Bench(
         setting=setting,
         data=(train, held_out),
-        train=records_of(train, nodes, duration, 0.0, length),
-        held_out=records_of(held_out, nodes, duration, start_time, length),
+        train=records_of(train, nodes, duration, None, length),
+        held_out=records_of(held_out, nodes, duration, starts, length),
         schedules=schedule_names(data),
         duration=duration,
         first_sample=first,
@@ -160,7 +160,7 @@ def _rounds(bench: Bench, base: Fitted, most: int, bar: tqdm) -> Rounds:
         bar.set_description(f"round {len(rankings) + 1}")
         ranking = rank(fitted, bench.train, bench.schedules)
         rankings.append(ranking)
-        if ranking.p_value > LEVEL:
+        if ranking.p_value > LEVEL or (chosen and _at_floor(bench, fitted)):
             return Rounds(fitted, chosen, rankings, unfruitful)
         found = choose(fitted, ranking, bench.train, bench.held_out)
         slower = max((one for one in RATIOS if one <= _SLOWER * fitted.ratio), default=None)
@@ -182,12 +182,25 @@ def _rounds(bench: Bench, base: Fitted, most: int, bar: tqdm) -> Rounds:
     return Rounds(fitted, chosen, rankings, unfruitful)
 
 
+def _at_floor(bench: Bench, fitted: Fitted) -> bool:
+    """Whether so little is left, at one step and further ahead, that a name for it is moot.
+
+    What is left of a sharp effect behind a smooth law would get a name of its own otherwise.
+    """
+    errors = held_out_errors(fitted, bench.held_out)
+    one_step = np.sqrt(np.mean(errors**2, axis=0))
+    steps = ladder(fitted, bench.held_out, default_horizon(bench.data[1]))
+    floor = np.minimum(noise_in(errors), one_step)
+    ahead = np.sqrt(np.mean(steps**2, axis=0))
+    return bool(np.max(np.maximum(one_step, ahead) / floor) <= NEAR)
+
+
 def _at_slow_gain(bench: Bench, fitted: Fitted, ratio: float) -> tuple[Chosen | None, Ranking]:
     """A round with a predictor that follows its model for longer.
 
     Diffusion takes what the model lacks for noise, and the faster gain that comes of it swallows
-    effects that act slowly. What is found is confirmed at the slow gain, then refitted with the
-    diffusion free.
+    effects that act slowly. What is found is refitted with the diffusion free, and has to predict
+    held-out data better so as well.
     """
     slow = refit(fitted, bench.train, ratio, (ratio,))
     ranking = rank(slow, bench.train, bench.schedules)
@@ -195,7 +208,15 @@ def _at_slow_gain(bench: Bench, fitted: Fitted, ratio: float) -> tuple[Chosen | 
     if found is None:
         return None, ranking
     free = refit(found.fitted, bench.train, fitted.ratio, fitted.ratios)
-    return found._replace(fitted=free), ranking
+    before, after = (
+        likelihood_on(fitted, held_out_errors(one, bench.held_out)) for one in (fitted, free)
+    )
+    gain, p_value = better(before, after)
+    if p_value > LEVEL:
+        return None, ranking
+    # The round looked twice.
+    promised = min(2.0 * found.p_value, 1.0)
+    return found._replace(fitted=free, held_out_gain=gain, p_value=promised), ranking
 
 
 def _questioned(bench: Bench, fitted: Fitted, chosen: list[Chosen]) -> tuple[Fitted, list[Chosen]]:

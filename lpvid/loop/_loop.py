@@ -30,7 +30,8 @@ class Loop(NamedTuple):
         after: errors with the effects.
         noise_floor: least error that the records allow (ny,).
         noise_floor_from: how it was found, in words.
-        held_out: first and last sample of the held-out data, or of the test record.
+        held_out: first and last sample of the held-out data, or of the test record; of the first
+            record where there are several.
         horizon: samples of the `horizon` errors.
         ladder: the errors over the horizon.
         p_value: family-wise, that nothing is missing from the starting model.

@@ -58,7 +58,8 @@ class LoopModel(NamedTuple):
         """Response to the inputs of records, effects included; nothing measured is fed back.
 
         Args:
-            data: records like those that the model was found on; their time starts at zero.
+            data: records like those that the model was found on; their time starts at zero. A
+                schedule that leaves the range of those is held at its end.
             initial_states: of each record, in the structure's states; fitted to the records if
                 `None`.
 
@@ -112,7 +113,7 @@ class LoopModel(NamedTuple):
             raise ValueError(
                 f"data: {self.nodes.shape[1]} scheduling signals are needed, got {scheduling}."
             )
-        return records_of(data, self.nodes, self.duration, 0.0)
+        return records_of(data, self.nodes, self.duration)
 
 
 def loop_model(fitted: Fitted, nodes: np.ndarray, duration: float) -> LoopModel:

@@ -1,5 +1,7 @@
 """Records as the predictor takes them: joined, with nodes of the scheduling, and padded."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -8,7 +10,7 @@ from lpvid.effects import MEMORY
 from lpvid.loop._program import SLOTS, Records, history_of
 
 _NODES = 7
-"""Scheduling nodes of a varying model; between them the matrices are interpolated linearly."""
+"""Scheduling nodes of a varying model: Chebyshev's, through which the matrices' polynomial goes."""
 
 
 def scheduling_nodes(data: IOData) -> np.ndarray:
@@ -22,26 +24,39 @@ def scheduling_nodes(data: IOData) -> np.ndarray:
     kappa = np.asarray(data.kappa)
     if kappa.shape[1] != 1:
         raise ValueError(
-            f"The records have {kappa.shape[1]} scheduling signals: close_the_loop takes one. "
-            "Choose it with data.select, or give each operating point its own call."
+            f"The records have {kappa.shape[1]} scheduling signals: close_the_loop takes one. Give "
+            "one (data.select, or one column for --schedule), or each operating point its own call."
         )
     low, high = kappa.min(), kappa.max()
     if high - low < 1e-9 * max(abs(low), abs(high), 1.0):
         return kappa[:1]
-    return np.linspace(low, high, _NODES)[:, None]
+    places = -np.cos(_angles(_NODES))
+    return (0.5 * (low + high) + 0.5 * (high - low) * places)[:, None]
+
+
+def _angles(count: int) -> np.ndarray:
+    return np.pi * (np.arange(count) + 0.5) / count
+
+
+def _range(nodes: np.ndarray) -> tuple[float, float]:
+    """Middle and half width of the scheduling that the nodes were laid over."""
+    middle = 0.5 * float(nodes[0, 0] + nodes[-1, 0])
+    return middle, 0.5 * float(nodes[-1, 0] - nodes[0, 0]) / np.cos(_angles(len(nodes))[0])
 
 
 def _weights(kappa: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    # Linear interpolation over equally spaced nodes; outside of them the end segment is extended.
+    """Weights of the nodes (time, node) by barycentric interpolation; the ends are held."""
     if nodes.shape[0] == 1:
         return np.ones((kappa.shape[0], 1))
-    place = (kappa[:, 0] - nodes[0, 0]) / (nodes[1, 0] - nodes[0, 0])
-    left = np.clip(np.floor(place).astype(int), 0, nodes.shape[0] - 2)
-    share = place - left
-    weights = np.zeros((kappa.shape[0], nodes.shape[0]))
-    rows = np.arange(kappa.shape[0])
-    weights[rows, left], weights[rows, left + 1] = 1.0 - share, share
-    return weights
+    middle, half = _range(nodes)
+    at = np.clip((kappa[:, 0] - middle) / half, -1.0, 1.0)
+    angles = _angles(len(nodes))
+    away = at[:, None] + np.cos(angles)[None]
+    on_node = np.abs(away) < 1e-13
+    weights = (-1.0) ** np.arange(len(nodes)) * np.sin(angles) / np.where(on_node, 1.0, away)
+    hit = np.any(on_node, axis=1, keepdims=True)
+    weights = np.where(hit, on_node.astype(float), weights)
+    return weights / weights.sum(axis=1, keepdims=True)
 
 
 def schedule_names(data: IOData) -> tuple[str, ...]:
@@ -54,7 +69,11 @@ def schedule_names(data: IOData) -> tuple[str, ...]:
 
 
 def records_of(
-    data: IOData, nodes: np.ndarray, duration: float, start_time: float, length: int | None = None
+    data: IOData,
+    nodes: np.ndarray,
+    duration: float,
+    start_times: Sequence[float] | None = None,
+    length: int | None = None,
 ) -> Records:
     """Records for the predictor.
 
@@ -62,7 +81,7 @@ def records_of(
         data: one or several records.
         nodes: of the scheduling (node, nk).
         duration: s that the schedule "time" goes from −1 to 1 in.
-        start_time: s at which every record starts.
+        start_times: s at which each record starts; zero if `None`.
         length: samples to pad to, so that several records share one compiled program.
     """
     u, y = np.asarray(data.u), np.asarray(data.y)
@@ -70,14 +89,15 @@ def records_of(
     record = np.repeat(np.arange(lengths.size), lengths)
     first = np.zeros(u.shape[0])
     first[np.concatenate([[0], np.cumsum(lengths)[:-1]])] = 1.0
-    time = start_time + data.dt * np.concatenate([np.arange(n) for n in lengths])
+    begins = np.zeros(lengths.size) if start_times is None else np.asarray(start_times, float)
+    steps = [data.dt * np.arange(n) for n in lengths]
+    time = np.concatenate([begin + step for begin, step in zip(begins, steps, strict=True)])
     kappa = np.zeros((u.shape[0], 0)) if data.kappa is None else np.asarray(data.kappa)
     weights = _weights(kappa, nodes)
     follow = 2.0 * time[:, None] / duration - 1.0
     if kappa.shape[1]:
-        middle = 0.5 * (nodes[0] + nodes[-1])
-        half = max(float(0.5 * (nodes[-1] - nodes[0])[0]), 1e-12)
-        follow = np.concatenate([(kappa - middle) / half, follow], axis=1)
+        middle, half = _range(nodes) if len(nodes) > 1 else (float(nodes[0, 0]), 1e-12)
+        follow = np.concatenate([(kappa - middle) / max(half, 1e-12), follow], axis=1)
     counts = np.ones(u.shape[0])
     spare = 0 if length is None else length - u.shape[0]
 

@@ -6,6 +6,7 @@ import numpy as np
 from lpvid.analysis import residual_tests
 from lpvid.effects import Units, fill
 from lpvid.loop._assess import (
+    default_horizon,
     errors_of,
     ladder,
     noise_in,
@@ -56,7 +57,7 @@ def summarise(
     held_out = bench.data[1]
     count = held_out.n_samples
     if horizon is None:
-        horizon = int(np.clip(min(held_out.lengths) // 20, 5, 200))
+        horizon = default_horizon(held_out)
     errors = {name: held_out_errors(model, bench.held_out) for name, model in _both(base, fitted)}
     before, ladder_before, run_before = errors_of(base, bench.held_out, errors["before"], horizon)
     after, ladder_after, run_after = before, ladder_before, run_before
@@ -102,7 +103,7 @@ def summarise(
         after=after,
         noise_floor=floor,
         noise_floor_from="estimated from the top of the residual's spectrum",
-        held_out=(bench.first_sample, bench.first_sample + count - 1),
+        held_out=(bench.first_sample, bench.first_sample + held_out.lengths[0] - 1),
         horizon=horizon,
         ladder=Ladder(np.arange(1, horizon + 1), ladder_before, ladder_after),
         p_value=evidence.p_value,
@@ -113,7 +114,7 @@ def summarise(
         residual_tests=_classical(errors["after"], held_out),
         virtual_forces=virtual_forces(bench, fitted),
         series=Series(
-            (bench.first_sample + np.arange(count)) * held_out.dt,
+            np.asarray(bench.held_out.time)[:count],
             y,
             run_before,
             run_after,

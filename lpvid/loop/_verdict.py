@@ -63,7 +63,7 @@ def decide(evidence: Evidence) -> tuple[str, str]:
     seen = evidence.p_value_left < LEVEL and not evidence.near <= NEAR
     left = seen or not (evidence.near <= FAR or evidence.explained >= NEARLY_ALL)
     if not evidence.named:
-        if evidence.p_value >= LEVEL:
+        if evidence.p_value >= LEVEL and not left:
             return "nothing to add", (
                 "No effect of the library explains what the model leaves: it is what noise alone "
                 "would leave. A richer input or a longer record could still show more."

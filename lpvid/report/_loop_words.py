@@ -29,7 +29,7 @@ def headline(loop: Loop) -> str:
         "nothing to add": "Nothing to add",
         "named": f"Found: {names}",
         "named, remainder unknown": f"Found: {names}; something else remains",
-        "abstain": "No verdict: these records do not decide",
+        "abstain": "No name: something may be missing that no effect explains",
     }.get(loop.verdict, loop.verdict)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lpvid.data import IOData, join
+from lpvid.data import IOData
 from lpvid.loop import close_the_loop, structure_named
 
 SAMPLES = 300
@@ -28,7 +28,8 @@ SERVO = structure_named("servo", DATA)
         (DATA, {"test": _data(40)}, "40 to decide"),
         (DATA, {"test": _data(dt=0.02)}, "test has a sample time of 0.02 s and data one of 0.01"),
         (DATA, {"test": _data(kappa=0.5)}, "data and test need a scheduling signal"),
-        (DATA, {"test": join([DATA, DATA])}, "test has 2 records and data 1: give as many"),
+        (DATA, {"horizon": 0}, "horizon=0 must be a number of samples"),
+        (DATA, {"horizon": 60}, "horizon=60 is more than half of a held-out record of 100"),
         (DATA, {"test": _data(ny=2)}, "test has 1 inputs and 2 outputs; the structure 'servo'"),
         (_data(nu=2), {}, "data has 2 inputs and 1 outputs; the structure 'servo' has 1 and 1"),
         (DATA.replace(u=np.ones(SAMPLES)), {}, "input 'u1' is constant.*or excite it"),

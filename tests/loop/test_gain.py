@@ -25,7 +25,7 @@ def _gains(ratio):
     data = IOData(u=np.zeros((20, 2)), y=np.zeros((20, 2)), dt=0.05)
     structure = structure_named("mass-spring-damper", data)
     setting = Setting(structure, (law("coulomb"),), 0.05)
-    records = records_of(data, np.zeros((1, 0)), 1.0, 0.0)
+    records = records_of(data, np.zeros((1, 0)), 1.0)
     got = gains(setting, records, jnp.asarray(THETA), jnp.asarray(NOISE), jnp.asarray(ratio))
     model = sampled(structure.ports(jnp.asarray(THETA), jnp.zeros(0)), jnp.asarray(0.05))
     return np.asarray(got), model

@@ -34,6 +34,26 @@ def test_several_records_are_simulated_one_after_the_other(loop):
         np.testing.assert_allclose(part, alone, rtol=0.0, atol=1e-9)
 
 
+def test_held_out_parts_of_several_records_keep_their_own_clock():
+    lengths = (400, 700)
+    data = join([record(samples=n, seed=n) for n in lengths])
+    loop = closed(data, laws=())
+    # Two thirds estimate, rounded; each held-out part goes on where its own record was cut.
+    cuts = [round(2 / 3 * n) for n in lengths]
+    expected = np.concatenate(
+        [data.dt * np.arange(cut, n) for cut, n in zip(cuts, lengths, strict=True)]
+    )
+    np.testing.assert_allclose(loop.series.time, expected, rtol=1e-12)
+    assert loop.held_out == (cuts[0], lengths[0] - 1)
+
+
+def test_test_records_may_be_more_than_those_that_estimate():
+    test = join([record(seed=41), record(seed=42)])
+    loop = closed(record(seed=40), test=test, laws=())
+    assert loop.series.output.shape == (test.n_samples, 1)
+    assert loop.after.one_step[0] < 1.2 * NOISE
+
+
 def test_records_of_another_kind_are_refused(loop):
     other = record(coulomb(0.4), seed=32)
     with pytest.raises(ValueError, match="resample"):

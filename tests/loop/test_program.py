@@ -41,7 +41,7 @@ def _data(samples, dt=DT, hold=4):
 def _model(data, places):
     structure = structure_named("mass-spring-damper", data)
     setting = Setting(structure, LAWS, data.dt)
-    records = records_of(data, np.zeros((1, 0)), data.dt * data.n_samples, 0.0)
+    records = records_of(data, np.zeros((1, 0)), data.dt * data.n_samples)
     slots = slots_of(structure, places, 1)
     unknowns = empty_unknowns(THETA, 4, 1, 1)
     unknowns = eqx.tree_at(lambda v: v.start, unknowns, jnp.array([[0.05, -0.02, 0.1, 0.0]]))

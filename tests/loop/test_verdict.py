@@ -17,6 +17,10 @@ CLOSE, FAR = 1.0, 2.0 * NEAR
         (NO, NO, False, CLOSE, 0.0, "nothing to add"),
         (YES, YES, False, CLOSE, 0.0, "nothing to add"),
         (YES, YES, False, FAR, 0.0, "abstain"),
+        # Seen by no law of the library, yet far above the noise, or by the omnibus alone.
+        (NO, NO, False, FAR, 0.0, "abstain"),
+        (NO, YES, False, FAR, 0.0, "abstain"),
+        (NO, YES, False, CLOSE, 0.0, "nothing to add"),
         # Named: nothing left, too little left to matter, something left, seen by a test or not.
         (YES, NO, True, CLOSE, 0.99, "named"),
         (YES, NO, True, FAR, 0.99, "named, remainder unknown"),
