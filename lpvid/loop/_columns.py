@@ -37,7 +37,7 @@ class Along(NamedTuple):
         drive: Γ at the nodes, as NumPy array.
         ramp: Γ̇ at the nodes, as NumPy array.
         states: with the sample seen, and before it (time, state).
-        inputs: with what effects add to them (time, nu).
+        forces: inputs with what effects add to them, then forces at the coordinates (time, drive).
         errors: innovations, padding left out (time, ny).
     """
 
@@ -52,7 +52,7 @@ class Along(NamedTuple):
     drive: np.ndarray
     ramp: np.ndarray
     states: tuple[Array, Array]
-    inputs: Array
+    forces: Array
     errors: np.ndarray
 
 
@@ -87,7 +87,7 @@ def along(setting: Setting, records: Records, slots: Slots, unknowns: Unknowns, 
         np.asarray(matrices.drive),
         np.asarray(matrices.ramp),
         (trace.state, trace.before),
-        records.u + trace.forces[:, :nu],
+        trace.forces.at[:, :nu].add(records.u),
         np.asarray(trace.innovations)[: int(np.sum(np.asarray(records.counts)))],
     )
 
@@ -114,10 +114,10 @@ def _varied(trace: Along, place: Place, varying: Sampled) -> Signal:
     records = trace.records
     own = jax.tree.map(lambda leaf: np.asarray(leaf[place.where]), varying)
     follow = np.asarray(records.schedules[:, place.schedule])[:, None]
-    weights, nu = np.asarray(records.weights), records.u.shape[1]
+    weights = np.asarray(records.weights)
     seen, before = (np.asarray(states) for states in trace.states)
     moved = _over_nodes(weights, own.transition, seen)
-    moved = moved + _over_nodes(weights, own.drive[:, :, :nu], np.asarray(trace.inputs))
+    moved = moved + _over_nodes(weights, own.drive, np.asarray(trace.forces))
     said = _over_nodes(weights, own.C, before)
     said = said + _over_nodes(weights, own.D, np.asarray(records.u))
     return moved * follow, said * follow
