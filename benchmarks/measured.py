@@ -30,7 +30,7 @@ from tqdm import tqdm
 from lpvid.data import IOData
 from lpvid.effects import AbstractLaw, at, law
 from lpvid.loop import FoundEffect, Loop, LoopModel, close_the_loop
-from lpvid.loop.structures import BlackBox, Servo
+from lpvid.loop.structures import BlackBox, PortedMassSpringDamper, Servo
 from lpvid.report import text_table
 
 
@@ -241,7 +241,8 @@ def drone_file(folder: Path, name: str) -> IOData:
 def quarter_drone(folder: Path) -> Outcome:
     # Before and after, the arm lies on its stop.
     data = drone_file(folder, "sinal4_multiseno_malha_fechada.csv")[_drone(16.0) : _drone(92.0)]
-    structure = Servo(data)
+    # About its place the hinged arm is a pendulum: it has a stiffness.
+    structure = PortedMassSpringDamper(data)
     loop = close_the_loop(structure, data)
     test = drone_file(folder, "sinal3_swept_sine_malha_fechada.csv")
     errors = [
