@@ -4,6 +4,7 @@ import argparse
 import time
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -50,6 +51,8 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
     if offset is not None and rest is not None:
         test, _ = without_rest(test, offset, rest)
         train, offset = without_rest(train, offset, rest)
+        # It is out of the records now, and must not be taken out again.
+        fit = eqx.tree_at(lambda one: one.output_offset, fit, jnp.zeros_like(rest))
     models = {"identified": fit.model}
     refined = None
     if arguments.refine:

@@ -98,7 +98,7 @@ def test_an_abstention_is_no_fault(capsys, tmp_path, tables, engine):
     engine.found = abstained()
     figures = tmp_path / "figures.json"
     assert main(["close-loop", tables["0.0"], *COLUMNS, "--json", str(figures)]) == 0
-    assert "No verdict" in capsys.readouterr().out
+    assert "No name" in capsys.readouterr().out
     content = json.loads(figures.read_text())
     assert content["verdict"] == "abstain" and content["effects"] == []
     assert content["error"]["after"]["free_run"] == [None]

@@ -56,6 +56,15 @@ def test_offsets_are_kept_if_asked(capsys, tmp_path, tables):
 
 
 @pytest.mark.slow
+def test_refinement_takes_offsets_out_once(capsys, tmp_path, tables):
+    argv = [tables["0.0"], "--input", "u", "--output", "y", "--time", "t", "--order", "4"]
+    content, _ = identified(capsys, tmp_path, [*argv, "--refine"])
+    assert content["offsets"]["y"][0][0] == pytest.approx(-2.0, abs=0.05)
+    assert content["fit"]["train"][0] > content["fit_before_refinement"]["train"][0] - 1e-3
+    assert content["fit"]["test"][0] > 99.5
+
+
+@pytest.mark.slow
 def test_several_files_are_several_records(capsys, tmp_path):
     files = [write_table(tmp_path / f"{k}.csv", np.zeros(n), k) for k, n in enumerate((500, 400))]
     argv = [*files, "--input", "u", "--output", "y", "--dt", "0.01", "--order", "4"]
