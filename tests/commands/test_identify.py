@@ -56,12 +56,19 @@ def test_offsets_are_kept_if_asked(capsys, tmp_path, tables):
 
 
 @pytest.mark.slow
-def test_refinement_takes_offsets_out_once(capsys, tmp_path, tables):
-    argv = [tables["0.0"], "--input", "u", "--output", "y", "--time", "t", "--order", "4"]
+def test_refinement_takes_offsets_out_once(capsys, tmp_path):
+    # A slow lag from rest: over the record its mean is far from its offset.
+    rng = np.random.default_rng(3)
+    u, y = np.repeat(rng.standard_normal(40), 10), np.zeros(400)
+    for k in range(399):
+        y[k + 1] = 0.995 * y[k] + 0.005 * (u[k] + 1.0)
+    table = np.c_[DT * np.arange(400), u, y + 1e-3 * rng.standard_normal(400)]
+    file = tmp_path / "slow.csv"
+    np.savetxt(file, table, delimiter=",", header="t,u,y", comments="")
+    argv = [str(file), "--input", "u", "--output", "y", "--time", "t", "--order", "1"]
     content, _ = identified(capsys, tmp_path, [*argv, "--refine"])
-    assert content["offsets"]["y"][0][0] == pytest.approx(-2.0, abs=0.05)
-    assert content["fit"]["train"][0] > content["fit_before_refinement"]["train"][0] - 1e-3
-    assert content["fit"]["test"][0] > 99.5
+    assert content["fit"]["train"][0] > content["fit_before_refinement"]["train"][0] - 0.1
+    assert content["poles"][0]["re"] == pytest.approx(0.995, abs=5e-4)
 
 
 @pytest.mark.slow
