@@ -75,7 +75,7 @@ print(lv.report.loop_text(found))
 # the law drawn in; the error over the horizon; what else was tried.
 
 # %%
-lv.plot.loop(found)
+figure = lv.plot.loop(found)
 
 # %% [markdown]
 # ## Beside the truth
