@@ -4,7 +4,6 @@ import argparse
 import time
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -22,11 +21,11 @@ from lpvid.commands._records import (
     check_columns,
     offsets_of,
     read_records,
+    with_rest,
     without_offsets,
-    without_rest,
 )
 from lpvid.data import IOData
-from lpvid.identify import Fit, identify, simulation_fit
+from lpvid.identify import identify, simulation_fit
 from lpvid.io import save
 from lpvid.models import StateSpace
 from lpvid.refinement import Innovation, OutputError, Refined, refine
@@ -47,20 +46,18 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
         raise UsageError("--predictor says what --refine fits: give both")
     offset, (train, test) = without_offsets(arguments, train, test)
     fit = identify(train, method)
-    rest = fit.output_offset if isinstance(fit, Fit) else None
-    if offset is not None and rest is not None:
-        test, _ = without_rest(test, offset, rest)
-        train, offset = without_rest(train, offset, rest)
-        # It is out of the records now, and must not be taken out again.
-        fit = eqx.tree_at(lambda one: one.output_offset, fit, jnp.zeros_like(rest))
-    models = {"identified": fit.model}
+    fits: dict[str, Any] = {"identified": fit}
     refined = None
     if arguments.refine:
         predictor = Innovation() if arguments.predictor == "innovation" else OutputError()
         refined = refine(fit, train, predictor=predictor)
-        models["refined"] = refined.model
-    scores = {name: _scores(model, train, test) for name, model in models.items()}
-    model = models["refined" if arguments.refine else "identified"]
+        fits["refined"] = refined
+    scores = {name: _scores(found, train, test) for name, found in fits.items()}
+    final = fits["refined" if arguments.refine else "identified"]
+    model = final.model
+    rest = getattr(final, "output_offset", None)
+    if offset is not None and rest is not None:
+        offset = with_rest(offset, rest)
     stable = bool(model.is_stable())
     _print(arguments, poles_of(model, refined), scores, train, stable, offset is not None)
     if arguments.out is not None:
@@ -94,10 +91,10 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
         print(f"Figures written to {arguments.json}")
 
 
-def _scores(model: StateSpace, train: IOData, test: IOData) -> dict[str, np.ndarray]:
+def _scores(fit: Any, train: IOData, test: IOData) -> dict[str, np.ndarray]:
     return {
-        "train": np.asarray(simulation_fit(model, train)),
-        "test": np.asarray(simulation_fit(model, test)),
+        "train": np.asarray(simulation_fit(fit, train)),
+        "test": np.asarray(simulation_fit(fit, test)),
     }
 
 

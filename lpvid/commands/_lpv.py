@@ -25,8 +25,8 @@ from lpvid.commands._records import (
     offsets_of,
     read_records,
     subspace_method,
+    with_rest,
     without_offsets,
-    without_rest,
 )
 from lpvid.data import IOData, Offset, join
 from lpvid.identify import Fit, identify, simulation_fit
@@ -192,7 +192,8 @@ def _identify(
     except ValueError as error:
         raise UsageError(f"at K = {written(kappa)}: {error}") from error
     if offset is not None and fit.output_offset is not None:
-        data, offset = without_rest(data, offset, fit.output_offset)
+        data = data.replace(y=data.y - fit.output_offset[None])
+        offset = with_rest(offset, fit.output_offset)
     # Of an ill-conditioned fit, `identify` says only that.
     if not bool(fit.model.is_stable()) and not bool(fit.status == Status.unstable):
         warnings.add("the model is not stable; ask for --stabilise, or another --order")

@@ -120,10 +120,10 @@ def any_method(
     )
 
 
-def without_rest(data: IOData, offset: Offset, rest: Float[Array, " ny"]) -> tuple[IOData, Offset]:
-    """Data freed of what the means have left of the outputs' offsets, and the offsets as now known.
+def with_rest(offset: Offset, rest: Float[Array, " ny"]) -> Offset:
+    """The offsets as a fit knows them: the means, and what they have left of the outputs'.
 
-    The mean of a record is not quite its offset: a slow response moves it.
+    The mean of a record is not quite its offset: a slow response moves it. One rest for all
+    records, as the fit estimates it.
     """
-    whole = Offset(u=offset.u, y=offset.y + rest[None])
-    return data.replace(y=data.y - rest[None]), whole
+    return Offset(u=offset.u, y=offset.y + rest[None])

@@ -46,7 +46,9 @@ class Chunks:
     """One record as consecutive chunks that are read anew for every pass over the data.
 
     `identify` goes over the data two or three times and holds one chunk and one piece of 32768
-    samples at a time; memory does not depend on the record's length.
+    samples at a time; memory does not depend on the record's length. Of an unstable model B, D,
+    offset and x0, and with them `residual_std` and the covariances, come from the first piece
+    alone.
 
     Args:
         source: called without arguments for each pass; gives the chunks in time order, each an

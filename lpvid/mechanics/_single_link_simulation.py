@@ -116,7 +116,7 @@ def simulate_single_link(
 
     Raises:
         ValueError: a reference of another shape, `dt` not positive, `substeps` below one, noise
-            without a key, a delay longer than its capacity.
+            without a key, a delay longer than its capacity, backlash and a rotor without inertia.
 
     Example:
         >>> from lpvid.mechanics import reference_single_link_arm
@@ -136,11 +136,20 @@ def simulate_single_link(
     if effects.noise is not None and key is None:
         raise ValueError("key: sensor noise needs a random key, jax.random.key(seed).")
     _check_delay(effects.delay, dt)
+    if effects.backlash is not None and _is_zero(arm.rotor_inertia):
+        raise ValueError(
+            "arm: its rotor_inertia is zero, but with backlash the rotor moves on its own; give it "
+            "an inertia, or leave the backlash out."
+        )
     controller = OpenLoop() if controller is None else controller
     start_angle = jnp.asarray(start_angle, float)
     return _simulate(
         arm, controller, effects, reference, jnp.asarray(dt), start_angle, key, substeps
     )
+
+
+def _is_zero(value: Array) -> bool:
+    return not isinstance(value, Tracer) and bool(np.any(np.asarray(value) == 0.0))
 
 
 @eqx.filter_jit

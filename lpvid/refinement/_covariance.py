@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from lpvid.refinement._criterion import Problem
 from lpvid.refinement._levenberg_marquardt import Unknowns
-from lpvid.refinement._losses import covariance, inverse_factor
+from lpvid.refinement._losses import covariance
 
 # Eigenvalues of the correlation matrix below this share of the largest are rounding.
 _RANK = 1e-12
@@ -21,7 +21,7 @@ class Uncertainty(eqx.Module):
     """Covariances of the values.
 
     Attributes:
-        covariance: for white noise, the inverse of the information matrix.
+        covariance: for white noise.
         robust_covariance: for noise of any colour (independent of the input).
         unidentified: values that take part in a direction that leaves the output as it is.
     """
@@ -41,10 +41,12 @@ def uncertainty(
 ) -> Uncertainty:
     r"""Covariances at a solution.
 
-    P = H⁻¹ with the information H = Σ Jᵀ Λ⁻¹ J, the initial states eliminated; robust P S P with
-    S = Σ_τ k(τ) Σ_t J_tᵀ Λ⁻¹ Γ(τ) Λ⁻¹ J_{t−τ}: the residual's autocovariance Γ under a Bartlett
-    window k of 2 √N lags (Newey and West 1987, the sensitivities taken as known). What the fit took
-    out of the residual's spectrum is put back, so that S = H in expectation for white noise.
+    H⁻¹ S H⁻¹ with H = Σ Jᵀ Q J, the initial states eliminated, Q the loss's curvature, and for
+    white noise S = Σ Jᵀ Q Γ(0) Q J, Γ the covariance of the loss's influence (Huber 1967). Where
+    Q = Γ(0)⁻¹, as for the Gaussian likelihood, that is H⁻¹, the Cramér–Rao bound. For noise of any
+    colour S = Σ_τ k(τ) Σ_t J_tᵀ Q Γ(τ) Q J_{t−τ} under a Bartlett window k of 2 √N lags (Newey and
+    West 1987, the sensitivities taken as known). What the fit took out of the residual's spectrum
+    is put back, so that both agree in expectation for white noise.
     Directions whose information is rounding are left out. Holds all records' sensitivities.
 
     Args:
@@ -61,7 +63,9 @@ def uncertainty(
     moved = problem.loss.influence(residual, mask, problem.scale)
     share = samples / jnp.maximum(samples - degrees / ny, 1.0)
     noise = share * covariance(moved, mask) + jnp.diag(problem.floor)
-    factor = inverse_factor(noise)
+    factor = problem.loss.curvature(residual, mask, problem.scale, noise)
+    # Covariance of the influence under the loss's own weights: the identity where they are best.
+    spread = factor @ noise @ factor.T
     lags = min(int(2.0 * longest**0.5) + 1, longest - 1)
     length = 1 << (longest + lags - 1).bit_length()
     shared, own = projected(at, factor, jnp.where(held, 0.0, 1.0))
@@ -71,21 +75,30 @@ def uncertainty(
     parts = [jnp.fft.rfft((moved @ factor.T)[:, None], length, axis=2)]
     if own.shape[1]:
         parts.append(jnp.fft.rfft(own, length, axis=2))
-    raw = sum(jnp.einsum("rpfa,rpfb->fab", part, jnp.conj(part)) for part in parts)
+    raw, *taken = [jnp.einsum("rpfa,rpfb->fab", part, jnp.conj(part)) for part in parts]
     through = jnp.einsum("pq,rqfa->rpfa", inverse.astype(complex), waves)
-    raw = raw + jnp.einsum("rpfa,rpfb->fab", through, jnp.conj(waves))
+    taken.append(jnp.einsum("rpfa,rpfb->fab", through, jnp.conj(waves)))
+    root = _symmetric_root(spread).astype(complex)[None]
+    raw = raw + root @ sum(taken) @ root
     spectrum = _smoothed(raw, lags, length, samples)
     twice = np.full(length // 2 + 1, 2.0 / length)
     twice[[0, -1]] = 1.0 / length
     shaped = jnp.einsum("f,fab,rqfb->rqfa", twice.astype(complex), spectrum, waves)
     meat = jnp.real(jnp.einsum("rpfa,rqfa->pq", jnp.conj(waves), shaped))
     robust = inverse @ meat @ inverse
+    white = inverse @ jnp.einsum("rpta,ab,rqtb->pq", shared, spread, shared) @ inverse
     basis = problem.basis
     return Uncertainty(
-        covariance=basis @ inverse @ basis.T,
+        covariance=basis @ (0.5 * (white + white.T)) @ basis.T,
         robust_covariance=basis @ (0.5 * (robust + robust.T)) @ basis.T,
         unidentified=silent(basis) > _PART,
     )
+
+
+def _symmetric_root(matrix: Float[Array, "ny ny"]) -> Float[Array, "ny ny"]:
+    """The positive semidefinite square root."""
+    values, vectors = jnp.linalg.eigh(matrix)
+    return (vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None]) @ vectors.T
 
 
 def _smoothed(raw: Array, lags: int, length: int, samples: Array) -> Array:

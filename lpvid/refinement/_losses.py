@@ -54,6 +54,15 @@ class AbstractLoss(eqx.Module):
     def influence(self, residual: Residual, mask: Mask, scale: Array) -> Residual:
         """The residual as it moves the estimate: what the covariance is computed from."""
 
+    @abc.abstractmethod
+    def curvature(
+        self, residual: Residual, mask: Mask, scale: Array, noise: Float[Array, "ny ny"]
+    ) -> Float[Array, "ny ny"]:
+        """F with Fᵀ F the loss's mean second derivative by the output, a sample.
+
+        `noise` is the covariance of the influence.
+        """
+
 
 def covariance(residual: Residual, mask: Mask) -> Float[Array, "ny ny"]:
     """Second moments of a residual over all records."""
@@ -97,6 +106,13 @@ class SquaredLoss(AbstractLoss):
         """The residual itself."""
         del mask, scale
         return residual
+
+    def curvature(
+        self, residual: Residual, mask: Mask, scale: Array, noise: Float[Array, "ny ny"]
+    ) -> Float[Array, "ny ny"]:
+        """The inverse Cholesky factor of the noise: the weights are the best ones."""
+        del residual, mask, scale
+        return inverse_factor(noise)
 
 
 class HuberLoss(AbstractLoss):
@@ -152,9 +168,22 @@ class HuberLoss(AbstractLoss):
     def influence(self, residual: Residual, mask: Mask, scale: Array) -> Residual:
         """σ ψ(r / σ) over the mean of ψ', whose variance is that of the estimate."""
         limit = self.threshold * scale[None, None, :]
+        share = self._quadratic(residual, mask, scale)
+        return jnp.clip(residual, -limit, limit) / share[None, None, :]
+
+    def curvature(
+        self, residual: Residual, mask: Mask, scale: Array, noise: Float[Array, "ny ny"]
+    ) -> Float[Array, "ny ny"]:
+        """Root of the mean of ψ'(r / σ) / σ²: outputs are weighted alone, correlated or not."""
+        del noise
+        return jnp.diag(jnp.sqrt(self._quadratic(residual, mask, scale)) / scale)
+
+    def _quadratic(self, residual: Residual, mask: Mask, scale: Array) -> Float[Array, " ny"]:
+        """Mean of ψ': share of the samples where the loss is quadratic."""
+        limit = self.threshold * scale[None, None, :]
         inside = (jnp.abs(residual) <= limit) & mask[:, :, None]
         share = jnp.sum(inside, axis=(0, 1), dtype=float) / jnp.sum(mask, dtype=float)
-        return jnp.clip(residual, -limit, limit) / jnp.maximum(share, 0.1)[None, None, :]
+        return jnp.maximum(share, 0.1)
 
 
 def inverse_factor(noise: Float[Array, "ny ny"]) -> Float[Array, "ny ny"]:

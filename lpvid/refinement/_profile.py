@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from lpvid._results import Status
 from lpvid._solve import Bounds
 from lpvid.data import IOData
+from lpvid.refinement._offset import taken_out
 from lpvid.refinement._parameterisation import padded_records
 from lpvid.refinement._refined import Refined
 from lpvid.refinement._search import search
@@ -113,8 +114,9 @@ def profile_likelihood(
             "refined: a robust loss is no likelihood (its scale is estimated apart); refine with "
             "SquaredLoss() for a profile."
         )
-    if refined.output_offset is not None:
-        data = data.replace(y=data.y - refined.output_offset[None])
+    offset = taken_out(refined)
+    if offset is not None:
+        data = data.replace(y=data.y - offset[None])
     if task.parameterisation.gauge(refined.parameters) is not None:
         raise ValueError(
             "refined: the entries of a black box depend on the basis of its state; profile a "

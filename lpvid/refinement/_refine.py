@@ -15,9 +15,11 @@ from lpvid._solve import Bounds
 from lpvid.data import IOData
 from lpvid.refinement._coordinates import Selection, Ties, matching, select
 from lpvid.refinement._losses import AbstractLoss, SquaredLoss
+from lpvid.refinement._offset import WithOffset, starting_offset
 from lpvid.refinement._parameterisation import (
     AbstractParameterisation,
     LinearParameterisation,
+    channel_sizes,
     padded_records,
 )
 from lpvid.refinement._predictors import AbstractPredictor, OutputError
@@ -36,6 +38,7 @@ def refine(
     fixed: Sequence[str] = (),
     tied: Ties = (),
     initial_state: str | ArrayLike = "free",
+    output_offset: str | ArrayLike | None = None,
     max_steps: int = 100,
     throw: bool = True,
 ) -> Refined:
@@ -55,9 +58,9 @@ def refine(
     record's Jacobian; records are padded to the longest.
 
     Args:
-        model: what `identify`, `identify_mechanical`, `identify_step_response` or `refine` returned
-            (an output offset is taken out of the data and kept as it is), a `StateSpace` (discrete
-            at the data's sample time, or continuous: zero-order hold), `StructuredModel`,
+        model: what `identify`, `identify_mechanical`, `identify_step_response` or `refine`
+            returned, a `StateSpace` (discrete at the data's sample time, or continuous: zero-order
+            hold), `StructuredModel`,
             `LPVStateSpace` (its coefficients, along the data's `kappa`), `GrayBoxLPV` (its
             parameters), or any `eqx.Module` with `simulate(u=, dt=, x0=)`, and `kappa=` where it
             takes one, whose inexact arrays are the parameters and whose `n_states`
@@ -69,9 +72,12 @@ def refine(
             structure's own.
         fixed: names of parameters that keep the value they start with.
         tied: names of parameters that share one value: a pattern, or several patterns, a group. Of
-            a black box, `fixed` and `tied` may name entries of D alone.
+            a black box, `fixed` and `tied` may name entries of D and offsets alone.
         initial_state: `"free"` (estimated, one a record), `"zero"`, or known states (nx,) or
             (record, nx).
+        output_offset: `"free"` (a constant in each output, common to all records, is estimated as
+            `offset[k]`) or known constants (ny,); by default, what the fit that is refined did, so
+            that an estimated offset stays an unknown and the intervals of the gain account for it.
         max_steps: limit on the trial steps.
         throw: raise where no fit came out. `False` returns it with its status, and warns.
 
@@ -105,10 +111,13 @@ def refine(
         raise ValueError(f"loss={loss!r}: give SquaredLoss() or HuberLoss().")
     if max_steps < 1:
         raise ValueError(f"max_steps: at least 1 is needed, got {max_steps}.")
-    offset = getattr(model, "output_offset", None)
+    offset, estimated = starting_offset(model, output_offset, data.ny)
     if offset is not None:
         data = data.replace(y=data.y - offset[None])
     start = recognise(model, data, predictor)
+    if estimated and offset is not None:
+        kind = WithOffset(start.parameterisation, offset, channel_sizes(data.y))
+        start = Start(kind, jnp.concatenate([start.values, offset]))
     task, chosen = prepare(start, data, predictor, loss, bounds, fixed, tied, initial_state)
     records = padded_records(data)
     own = task.own(*records[1].shape)
@@ -134,7 +143,7 @@ def prepare(
     kind = start.parameterisation
     selection = select(kind.names, start.values, fixed, tied)
     lower, upper = _bounds(kind, bounds)
-    black_box = isinstance(kind, LinearParameterisation) and kind.black_box
+    black_box = _is_black_box(kind)
     remaining = 0
     if black_box:
         remaining = kind.n_states**2
@@ -165,16 +174,22 @@ def prepare(
     return task, chosen
 
 
+def _is_black_box(kind: AbstractParameterisation) -> bool:
+    """Whether the values depend on the basis of the state."""
+    kind = kind.model if isinstance(kind, WithOffset) else kind
+    return isinstance(kind, LinearParameterisation) and kind.black_box
+
+
 def _check_basis_free(kind: AbstractParameterisation, fixed: Sequence[str], tied: Ties) -> None:
     """Raise where something is to be held that depends on the basis of the state."""
     groups = [[pattern] if isinstance(pattern, str) else pattern for pattern in tied]
     for pattern in (*fixed, *(pattern for group in groups for pattern in group)):
         names = [kind.names[i] for i in matching(kind.names, pattern, "fixed, tied")]
-        if any(not name.startswith("D") for name in names):
+        if any(not name.startswith(("D", "offset")) for name in names):
             raise ValueError(
                 f"fixed, tied: {pattern!r} names entries that depend on the basis of the state, "
-                "which the search of a black box changes; hold entries of D only, or give a "
-                "StructuredModel."
+                "which the search of a black box changes; hold entries of D or offsets only, or "
+                "give a StructuredModel."
             )
 
 
@@ -195,7 +210,7 @@ def _bounds(
     lower, upper = kind.bounds()
     if not given:
         return lower, upper
-    if isinstance(kind, LinearParameterisation) and kind.black_box:
+    if _is_black_box(kind):
         raise ValueError(
             "bounds: the entries of a black box depend on the basis of its state, so they have no "
             "bounds; give a StructuredModel, for example of a ModalStructure."
@@ -236,6 +251,8 @@ def as_refined(
 ) -> Refined:
     """The public record of an outcome."""
     kind = task.parameterisation
+    if isinstance(kind, WithOffset):
+        offset = kind.output_offset(outcome.values)
     pieces = [outcome.residual[i, :length] for i, length in enumerate(data.lengths)]
     return Refined(
         model=kind.build(outcome.values),

@@ -25,8 +25,8 @@ class Refined(eqx.Module):
             `lpvid.analysis.propagate(function, parameters, covariance)`.
         robust_covariance: the same for noise of any colour that is independent of the input.
         x0: initial states, (record, nx).
-        output_offset: constant in the outputs that the fit given came with, taken out and not
-            refined, (ny,); None where there was none.
+        output_offset: constant to add to the model's outputs, (ny,), one of the parameters where
+            it is estimated; None where there is none.
         innovation_gain: K, (nx, ny), or None where it was not estimated.
         noise_covariance: of the residual, corrected for the unknowns estimated, (ny, ny).
         residual: y − ŷ, records one after the other as in the data, (time, ny).

@@ -290,6 +290,15 @@ def test_divergence_is_a_status():
             ),
             "capacity",
         ),
+        (
+            lambda: simulate_single_link(
+                dataclasses.replace(ARM, rotor_inertia=0.0),
+                reference=PUSH,
+                dt=DT,
+                effects=ArmEffects(backlash=Backlash(0.02)),
+            ),
+            "rotor_inertia",
+        ),
         (lambda: DryFriction(-0.1), "coulomb"),
         (lambda: DryFriction(0.4, stribeck_speed=0.0), "positive"),
         (lambda: Backlash(jnp.ones(2)), "one number"),

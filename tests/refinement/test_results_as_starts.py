@@ -35,7 +35,19 @@ def test_an_estimated_offset_is_kept(refined):
 def test_a_refined_model_is_a_start(refined):
     again = refine(refined, SHIFTED)
     np.testing.assert_allclose(again.model.A, refined.model.A, atol=1e-7)
-    np.testing.assert_array_equal(again.output_offset, refined.output_offset)
+    np.testing.assert_allclose(again.output_offset, refined.output_offset, atol=1e-7)
+
+
+def test_an_offset_is_estimated_on_request_or_known(refined):
+    free = refine(TRUTH, SHIFTED, output_offset="free")
+    np.testing.assert_allclose(free.output_offset, refined.output_offset, atol=1e-6)
+    assert free.parameter_names[-1] == "offset[0]"
+    known = refine(refined, SHIFTED, output_offset=[5.0])
+    assert known.output_offset == 5.0 and len(known.parameters) == 3
+    with pytest.raises(ValueError, match="output_offset: shape"):
+        refine(TRUTH, SHIFTED, output_offset=[1.0, 2.0])
+    with pytest.raises(ValueError, match="'free'"):
+        refine(TRUTH, SHIFTED, output_offset="estimate")
 
 
 def test_feedthrough_is_the_fits_under_jit_too(refined):
@@ -44,13 +56,14 @@ def test_feedthrough_is_the_fits_under_jit_too(refined):
         method = PastOutputMOESP(order=1, block_rows=5, feedthrough=False)
         return refine(identify(data, method), data).parameters
 
-    assert jax.jit(parameters)(CENTRED.y).shape == refined.parameters.shape == (3,)
+    assert jax.jit(parameters)(CENTRED.y).shape == (3,)
+    assert refined.parameter_names == ("A[0,0]", "B[0,0]", "C[0,0]", "offset[0]")
 
 
 def test_entries_of_a_black_box_cannot_be_held(refined):
-    with pytest.raises(ValueError, match="hold entries of D only"):
+    with pytest.raises(ValueError, match="hold entries of D or offsets"):
         refine(refined, SHIFTED, fixed=("A*",))
-    with pytest.raises(ValueError, match="hold entries of D only"):
+    with pytest.raises(ValueError, match="hold entries of D or offsets"):
         refine(refined, SHIFTED, tied=(("B*", "C*"),))
     with pytest.raises(ValueError, match="no bounds"):
         refine(refined, SHIFTED, bounds={"A*": (0.0, 1.0)})

@@ -37,6 +37,9 @@ _GROWTH = 1e-6
 class ContinuousTimeFit(eqx.Module):
     """Result of `identify` with a continuous-time method.
 
+    Without covariances, since the filters colour the noise: `lpvid.refine(fit, data)` starts from
+    it and has them.
+
     Attributes:
         model: the continuous-time model.
         x0: initial state of every record, (record, nx).

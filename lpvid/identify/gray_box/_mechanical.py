@@ -39,6 +39,9 @@ _MATRICES = ("mass", "damping", "stiffness")
 class MechanicalFit(eqx.Module):
     """Result of `identify_mechanical`: M ÿ + D ẏ + K y = u.
 
+    Without covariances, since the filters colour the noise: `lpvid.refine(fit, data)` starts from
+    it and has them.
+
     Attributes:
         mass: M (n, n), symmetric positive definite, in the units of input · s² / output.
         damping: D (n, n), symmetric positive semidefinite, input · s / output.

@@ -20,6 +20,9 @@ from lpvid.models import StateSpace
 class StepResponseFit(eqx.Module):
     """Result of `identify_step_response`.
 
+    Standard deviations of the moments are in `stats`; the model has none of its own:
+    `lpvid.refine(fit, data)` starts from it and has its covariance.
+
     Attributes:
         model: the continuous-time model.
         singular_values: of the method's Hankel matrix, largest first.
