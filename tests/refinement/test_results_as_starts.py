@@ -42,10 +42,10 @@ def test_an_offset_is_estimated_on_request_or_known(refined):
     free = refine(TRUTH, SHIFTED, output_offset="free")
     np.testing.assert_allclose(free.output_offset, refined.output_offset, atol=1e-6)
     assert free.parameter_names[-1] == "offset[0]"
-    known = refine(refined, SHIFTED, output_offset=[5.0])
+    known = refine(refined, SHIFTED, output_offset=np.array([5.0]))
     assert known.output_offset == 5.0 and len(known.parameters) == 3
     with pytest.raises(ValueError, match="output_offset: shape"):
-        refine(TRUTH, SHIFTED, output_offset=[1.0, 2.0])
+        refine(TRUTH, SHIFTED, output_offset=np.array([1.0, 2.0]))
     with pytest.raises(ValueError, match="'free'"):
         refine(TRUTH, SHIFTED, output_offset="estimate")
 
