@@ -1,5 +1,6 @@
 """Sensitivities of the innovations to candidates: injected along the trace, in one batch."""
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -72,7 +73,8 @@ def along(setting: Setting, records: Records, slots: Slots, unknowns: Unknowns, 
         gain: L at the nodes of κ.
     """
     trace = run(setting, records, slots, unknowns, gain)
-    matrices, weights = _nodes(setting, slots, unknowns, records)
+    # The laws do not matter here, and would make a program for each set of them.
+    matrices, weights = _nodes(setting, dataclasses.replace(slots, laws=()), unknowns, records)
     signals = port_signals(matrices, weights, records, trace)
     nu = records.u.shape[1]
     return Along(

@@ -1,5 +1,8 @@
 """Refits: a model with a candidate in its next slot, or without one of its effects."""
 
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
@@ -7,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpvid.effects import AbstractLaw
-from lpvid.loop._candidates import Place, Trial
+from lpvid.loop._candidates import Place, Trial, slots_of
 from lpvid.loop._columns import along, scales_of
 from lpvid.loop._program import SLOTS, Records, Unknowns
 from lpvid.loop._score import Scored
-from lpvid.loop._tune import Fitted, fit
+from lpvid.loop._search import errors_of
+from lpvid.loop._tune import Fitted, fit, varying
 
 _REALISED = 0.5
 """Share of the promised gain below which a refit counts as a failed search, not as evidence."""
@@ -77,6 +81,39 @@ def with_effect(fitted: Fitted, records: Records, entry: Ranked) -> Fitted:
         again = _refitted(fitted, records, place, unknowns)
         model = max(model, again, key=lambda one: one.searched.log_likelihood)
     return model
+
+
+@contextlib.contextmanager
+def compiled(
+    fitted: Fitted, records: Records, entries: Sequence[Ranked]
+) -> Iterator[Callable[[Ranked], None]]:
+    """Compile the programs of several refits in the background, while the first ones run.
+
+    Gives a function that waits until a candidate's program is there.
+
+    Args:
+        fitted: the model as it stands.
+        records: estimation data.
+        entries: the candidates, in the order they will be wanted.
+    """
+
+    def prepare(place: Place) -> None:
+        places = (*fitted.places, place)
+        setting = varying(fitted.setting, places)
+        slots = slots_of(setting.structure, places, records.schedules.shape[1])
+        errors_of(setting, records, slots, fitted.unknowns, fitted.gain)
+
+    with ThreadPoolExecutor(1) as pool:
+        waiting = {entry.trial.place: pool.submit(prepare, entry.trial.place) for entry in entries}
+
+        def ready(entry: Ranked) -> None:
+            if entry.trial.place in waiting:
+                waiting[entry.trial.place].result()
+
+        try:
+            yield ready
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def kept(fitted: Fitted, refitted: Fitted, promised: float) -> bool:

@@ -10,9 +10,9 @@ from lpvid.loop._candidates import Place, places_of
 from lpvid.loop._columns import along, force_columns, tests_at, trial_columns
 from lpvid.loop._compare import better, sample_likelihood
 from lpvid.loop._program import Records
-from lpvid.loop._refit import Ranked, kept, with_effect
+from lpvid.loop._refit import Ranked, compiled, kept, with_effect
 from lpvid.loop._score import ScoreTest, family_wise
-from lpvid.loop._search import run
+from lpvid.loop._search import errors_of
 from lpvid.loop._tune import Fitted, with_starts
 from lpvid.loop._verdict import LEVEL
 
@@ -115,9 +115,7 @@ def held_out_errors(fitted: Fitted, records: Records) -> np.ndarray:
         records: held-out data.
     """
     unknowns = with_starts(fitted, records)
-    out = run(fitted.setting, records, fitted.slots, unknowns, fitted.gain)
-    count = int(np.sum(np.asarray(records.counts)))
-    return np.asarray(out.innovations)[:count]
+    return errors_of(fitted.setting, records, fitted.slots, unknowns, fitted.gain)
 
 
 def likelihood_on(fitted: Fitted, errors: np.ndarray) -> np.ndarray:
@@ -177,17 +175,19 @@ def choose(fitted: Fitted, ranking: Ranking, records: Records, held_out: Records
         return None
     before = likelihood_on(fitted, held_out_errors(fitted, held_out))
     tried: list[tuple[Ranked, Fitted, np.ndarray]] = []
-    for entry in significant[:_ATTEMPTS]:
-        # Judged by the best that kept its promise: one that did not must not shut out the rest.
-        if tried and entry.scored.gain < _HOPEFUL * tried[0][0].scored.gain:
-            continue
-        if len(tried) == _REFITTED:
-            break
-        refitted = with_effect(fitted, records, entry)
-        if not kept(fitted, refitted, entry.scored.gain):
-            continue
-        errors = held_out_errors(refitted, held_out)
-        tried.append((entry, refitted, likelihood_on(refitted, errors)))
+    with compiled(fitted, records, significant[:_REFITTED]) as ready:
+        for entry in significant[:_ATTEMPTS]:
+            # Judged by the best that kept its promise: one that did not must not shut out the rest.
+            if tried and entry.scored.gain < _HOPEFUL * tried[0][0].scored.gain:
+                continue
+            if len(tried) == _REFITTED:
+                break
+            ready(entry)
+            refitted = with_effect(fitted, records, entry)
+            if not kept(fitted, refitted, entry.scored.gain):
+                continue
+            errors = held_out_errors(refitted, held_out)
+            tried.append((entry, refitted, likelihood_on(refitted, errors)))
     if not tried:
         return None
     tried = [one for one in tried if np.all(np.isfinite(one[2]))]

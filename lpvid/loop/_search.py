@@ -106,6 +106,28 @@ def injected(
     )
 
 
+def errors_of(
+    setting: Setting,
+    records: Records,
+    slots: Slots,
+    unknowns: Unknowns,
+    gain: Float[Array, "node state ny"],
+) -> np.ndarray:
+    """Innovations (time, ny), padding left out.
+
+    By the program that gives the sensitivities too: running it costs little beside compiling
+    another one.
+
+    Args:
+        setting: structure, laws, sample time.
+        records: signals.
+        slots: which effects.
+        unknowns: their numbers and the model's.
+        gain: L at the nodes of κ.
+    """
+    return sensitivities(setting, records, slots, unknowns, gain, np.zeros(1, int))[0]
+
+
 def sensitivities(
     setting: Setting,
     records: Records,

@@ -13,7 +13,7 @@ from lpvid.loop._candidates import Place, slots_of
 from lpvid.loop._gain import gains
 from lpvid.loop._path import AMPLITUDES
 from lpvid.loop._program import SHAPES, SLOTS, Records, Setting, Slots, Unknowns
-from lpvid.loop._search import Searched, log_likelihood, run, search
+from lpvid.loop._search import Searched, errors_of, log_likelihood, search
 
 RATIOS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0, 1e4)
 """Diffusions tried, relative to the outputs' noise. None at all would let errors of the parameters
@@ -185,12 +185,10 @@ def fit(
         at = ratios.index(near)
         # Far off, the optimum is worth a look only when a neighbour is better.
         neighbours = ratios[max(at - 2, 0) : at + 2]
-        count = int(np.sum(np.asarray(records.counts)))
         scored = []
         for level in neighbours:
             gain = gain_of(values, level)
-            errors = np.asarray(run(setting, records, slots, values, gain).innovations)[:count]
-            scored.append(log_likelihood(errors))
+            scored.append(log_likelihood(errors_of(setting, records, slots, values, gain)))
         return neighbours[int(np.argmax(scored))]
 
     best: tuple[Searched, Array, float] | None = None
