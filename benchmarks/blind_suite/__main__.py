@@ -5,6 +5,8 @@
 
 Records and answers are kept in `--folder` and a run that was stopped goes on where it was. Labels
 lie in a file apart, `labels.json`, which only the scorer reads (and the oracle, who is told).
+Compiled programs are kept there too, so the times a record are those of a study under way;
+`--only KEY` with a fresh folder shows the time of a first call.
 Development looks at seed 1, the reported figures come from seed 2. `--only KEY` solves one record;
 `--score` only prints.
 """
@@ -47,6 +49,9 @@ def _answers(path: Path) -> dict[str, dict]:
 def run(jobs: list, path: Path, processes: int) -> None:
     """Solve what has no answer yet and append the answers, one line each."""
     done = _answers(path)
+    kept = sum(job[0].key in done for job in jobs)
+    if kept:
+        print(f"{kept} answers from earlier runs are kept; --fresh forgets them")
     # By plant, whose programs are compiled once.
     jobs = sorted(
         (job for job in jobs if job[0].key not in done), key=lambda job: job[0].key.rsplit("-", 1)
@@ -117,6 +122,9 @@ def main() -> None:
     arguments = parser.parse_args()
 
     folder, records = _made(arguments)
+    # Programs recur from record to record; workers that let go of them read them again.
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder / "compiled"))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
     suffix = f"-{arguments.structure}" if arguments.structure else ""
     paths = [folder / f"{kind}{suffix}.jsonl" for kind in ("answers", "oracle")]
     if arguments.fresh:

@@ -24,7 +24,6 @@ def solve(record: Record, structure: str | None, told: list[str] | None = None) 
         from lpvid.data import IOData
         from lpvid.effects import LIBRARY
         from lpvid.loop import close_the_loop
-        from lpvid.loop.structures import structure_named
 
         data = IOData(
             u=record.u,
@@ -35,7 +34,8 @@ def solve(record: Record, structure: str | None, told: list[str] | None = None) 
             units={"u": record.input_units, "y": record.output_units},
         )
         laws = LIBRARY if told is None else tuple(law for law in LIBRARY if law.name in told)
-        loop = close_the_loop(structure_named(structure or record.structure, data), data, laws=laws)
+        # By name, so that the structure too is made from the estimation data alone.
+        loop = close_the_loop(structure or record.structure, data, laws=laws)
     except Exception as error:
         status = "".join(traceback.format_exception_only(error)).strip()
         where = traceback.format_exc(limit=-3)

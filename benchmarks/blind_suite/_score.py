@@ -117,6 +117,13 @@ def metrics(
         [set(_true(labels[k])) <= set(_named(results[k])) for k in by_case["one"]]
     )
     figures["two effects, both exact"] = _share([exact(k) for k in by_case["two"]])
+    figures["two effects: names and ports"] = _share(
+        [
+            sorted((e["name"], e["port"]) for e in results[k]["effects"])
+            == sorted((e["name"], e["port"]) for e in labels[k]["effects"])
+            for k in by_case["two"]
+        ]
+    )
     figures["two effects: at least one"] = _share(
         [bool(set(_true(labels[k])) & set(_named(results[k]))) for k in by_case["two"]]
     )
@@ -141,13 +148,16 @@ def metrics(
         found = results[key]["effects"]
         for truth in labels[key]["effects"]:
             inside.append(any(truth["name"] in _set_of(effect) for effect in found))
-            match = next((effect for effect in found if effect["name"] == truth["name"]), None)
+            same = [effect for effect in found if effect["name"] == truth["name"]]
+            # Of two with one name, the one at the right port.
+            match = min(same, key=lambda effect: effect["port"] != truth["port"], default=None)
             if match is not None:
                 true, value, std = scored_numbers(truth, match)
                 if not true.size:
                     continue
                 errors.append(100.0 * np.linalg.norm(value - true) / np.linalg.norm(true))
-                covered += list(np.abs(value - true) <= 1.96 * std)
+                # An interval without ends says nothing, so it counts as missed.
+                covered += list(np.isfinite(std) & (np.abs(value - true) <= 1.96 * std))
         sizes += [float(len(_set_of(effect))) for effect in found]
     figures["truth inside the named set"] = _share(inside)
     figures["size of the set, mean"] = (float(np.mean(sizes)) if sizes else np.nan), len(sizes)

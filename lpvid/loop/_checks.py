@@ -52,11 +52,11 @@ def checked_records(
         horizon: samples of the horizon error, if given.
 
     Raises:
-        DataError: non-finite, constant or too short signals, or ones that do not fit.
+        DataError: too short records, or ones that do not fit the structure or each other.
     """
     for name, one in (("data", data), ("test", test)):
         if one is not None:
-            _check_channels(name, one, structure)
+            _check_count(name, one, structure)
     if test is not None and not np.isclose(test.dt, data.dt, rtol=1e-9):
         raise DataError(
             f"test has a sample time of {test.dt} s and data one of {data.dt} s: resample one."
@@ -78,13 +78,50 @@ def checked_records(
         )
 
 
-def _check_channels(name: str, data: IOData, structure: AbstractPortedStructure) -> None:
+def checked_signals(data: IOData, test: IOData | None) -> None:
+    """Refuse signals that tell nothing, before a structure is made from them.
+
+    Args:
+        data: records.
+        test: other records, if any.
+
+    Raises:
+        DataError: non-finite or constant signals.
+    """
+    for name, one in (("data", data), ("test", test)):
+        if one is not None:
+            _check_signals(name, one)
+
+
+def checked_fit(log_likelihood: float, structure: AbstractPortedStructure) -> None:
+    """Refuse to go on from a model that the records could not be fitted with.
+
+    Args:
+        log_likelihood: of the model without effects.
+        structure: the base model.
+
+    Raises:
+        DataError: it is not finite.
+    """
+    if not np.isfinite(log_likelihood):
+        raise DataError(
+            f"The structure '{structure.name}' cannot be fitted to these records: its prediction "
+            "errors are not finite, or those of two outputs are the same. Check the sample time "
+            "and the channels' units, leave out an output that repeats another, or give another "
+            "structure."
+        )
+
+
+def _check_count(name: str, data: IOData, structure: AbstractPortedStructure) -> None:
     wanted = (len(structure.input_names), len(structure.output_names))
     if (data.nu, data.ny) != wanted:
         raise DataError(
             f"{name} has {data.nu} inputs and {data.ny} outputs; the structure "
             f"'{structure.name}' has {wanted[0]} and {wanted[1]}."
         )
+
+
+def _check_signals(name: str, data: IOData) -> None:
     for kind, signals, names in (
         ("input", np.asarray(data.u), data.input_names),
         ("output", np.asarray(data.y), data.output_names),

@@ -3,6 +3,9 @@
 import numpy as np
 import scipy.stats
 
+_SINGULAR = 1e-10
+"""Share of the variances added to a covariance, so that it has an inverse."""
+
 
 def window(samples: int) -> int:
     """Lags of the Bartlett window, growing with the cube root of the record.
@@ -34,6 +37,8 @@ def whitener(errors: np.ndarray) -> np.ndarray:
         errors: (time, ny).
     """
     covariance = errors.T @ errors / errors.shape[0]
+    # Two outputs that say the same leave it without an inverse.
+    covariance = covariance + _SINGULAR * np.diag(np.diag(covariance))
     return np.linalg.inv(np.linalg.cholesky(covariance)).T
 
 
@@ -44,7 +49,7 @@ def sample_likelihood(errors: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         errors: (time, ny).
         covariance: of the errors, from the estimation data (ny, ny).
     """
-    factor = np.linalg.cholesky(covariance)
+    factor = np.linalg.cholesky(covariance + _SINGULAR * np.diag(np.diag(covariance)))
     white = np.linalg.solve(factor, errors.T)
     return -0.5 * np.sum(white**2, axis=0) - float(np.sum(np.log(np.diag(factor))))
 
@@ -57,7 +62,7 @@ def better(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
         second: the same under the other.
 
     Returns:
-        Total gain, and the one-sided p-value of Student's test with a long-run variance.
+        Total gain, and the one-sided p-value of a normal test with a long-run variance.
     """
     difference = second - first
     if not np.all(np.isfinite(difference)):

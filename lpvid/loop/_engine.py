@@ -12,9 +12,10 @@ from lpvid.data import IOData
 from lpvid.effects import LIBRARY, AbstractLaw
 from lpvid.loop._assess import default_horizon, ladder, noise_in
 from lpvid.loop._bench import Bench
-from lpvid.loop._checks import checked_options, checked_records
+from lpvid.loop._checks import checked_fit, checked_options, checked_records, checked_signals
 from lpvid.loop._compare import better
 from lpvid.loop._loop import Loop
+from lpvid.loop._noise_floor import measured_floor
 from lpvid.loop._ported import AbstractPortedStructure
 from lpvid.loop._program import SLOTS, Setting
 from lpvid.loop._records import records_of, schedule_names, scheduling_nodes
@@ -97,6 +98,7 @@ def close_the_loop(
     """
     begun = time.perf_counter()
     checked_options(test, split, most_effects, horizon)
+    checked_signals(data, test)
     structure = _structure(model, data if test is not None else data.split(split)[0])
     checked_records(structure, data, test, split, horizon)
     bench = _bench(structure, data, test, split, tuple(laws))
@@ -138,6 +140,7 @@ def _bench(structure, data, test, split, laws) -> Bench:
         schedules=schedule_names(data),
         duration=duration,
         first_sample=first,
+        floor=measured_floor(data.records if test is None else data.records + test.records),
     )
 
 
@@ -150,6 +153,7 @@ def _base(bench: Bench) -> Fitted:
     unknowns = empty_unknowns(theta, ports.A.shape[0], len(train.lengths), ports.force.shape[2])
     noise = rough_noise(np.asarray(train.y))
     fitted = fit(bench.setting, bench.train, (), (), unknowns, noise)
+    checked_fit(fitted.searched.log_likelihood, structure)
     noise = np.maximum(noise_in(fitted.searched.errors), 1e-3 * noise)
     return fit(bench.setting, bench.train, (), (), fitted.unknowns, noise, ratio=fitted.ratio)
 
@@ -190,7 +194,7 @@ def _at_floor(bench: Bench, fitted: Fitted) -> bool:
     errors = held_out_errors(fitted, bench.held_out)
     one_step = np.sqrt(np.mean(errors**2, axis=0))
     steps = ladder(fitted, bench.held_out, default_horizon(bench.data[1]))
-    floor = np.minimum(noise_in(errors), one_step)
+    floor = np.minimum(bench.noise(errors), one_step)
     ahead = np.sqrt(np.mean(steps**2, axis=0))
     return bool(np.max(np.maximum(one_step, ahead) / floor) <= NEAR)
 

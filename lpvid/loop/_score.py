@@ -138,7 +138,7 @@ class ScoreTest:
         return Scored(gain, amplitude, float(scipy.stats.chi2.sf(2.0 * gain, wanted)))
 
     def projected(self, columns: np.ndarray) -> np.ndarray:
-        """Columns whitened, with what the model can already explain taken out.
+        """Columns, outputs decorrelated, with what the model can already explain taken out.
 
         Args:
             columns: (time, ny, column).

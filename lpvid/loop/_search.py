@@ -171,7 +171,7 @@ class Searched(NamedTuple):
         columns: their derivatives by the free unknowns (time, ny, column).
         places: the free unknowns, indices into the flattened ones.
         log_likelihood: concentrated over the innovations' covariance.
-        converged: whether the tolerance was reached.
+        converged: whether no further step was worth taking, or none was better.
     """
 
     unknowns: Unknowns

@@ -9,7 +9,6 @@ from lpvid.loop._assess import (
     default_horizon,
     errors_of,
     ladder,
-    noise_in,
     robust_covariance,
     standard_errors,
 )
@@ -64,8 +63,7 @@ def summarise(
     if chosen:
         after, ladder_after, run_after = errors_of(fitted, bench.held_out, errors["after"], horizon)
     y = np.asarray(held_out.y)
-    floor = np.minimum(noise_in(errors["after"]), noise_in(y - run_after))
-    floor = np.minimum(floor, after.one_step)
+    floor = np.minimum(bench.noise(errors["after"], y - run_after), after.one_step)
     last = rankings[-1]
     evidence = Evidence(
         p_value=rankings[0].p_value,
@@ -102,7 +100,11 @@ def summarise(
         before=before,
         after=after,
         noise_floor=floor,
-        noise_floor_from="estimated from the top of the residual's spectrum",
+        noise_floor_from=(
+            "estimated from the top of the residual's spectrum"
+            if bench.floor is None
+            else bench.floor.source
+        ),
         held_out=(bench.first_sample, bench.first_sample + held_out.lengths[0] - 1),
         horizon=horizon,
         ladder=Ladder(np.arange(1, horizon + 1), ladder_before, ladder_after),

@@ -1,10 +1,12 @@
 """What is refused before any work, and in which words."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from lpvid.data import IOData
-from lpvid.loop import close_the_loop, structure_named
+from lpvid.loop import _engine, close_the_loop, structure_named
 
 SAMPLES = 300
 RNG = np.random.default_rng(0)
@@ -41,6 +43,21 @@ SERVO = structure_named("servo", DATA)
 def test_faults_are_named(data, options, words):
     with pytest.raises(ValueError, match=words):
         close_the_loop(SERVO, data, **options)
+
+
+def test_signals_are_looked_at_before_a_structure_is_made_of_them():
+    with pytest.raises(ValueError, match="input 'u1' is constant"):
+        close_the_loop("servo", DATA.replace(u=np.ones(SAMPLES)))
+
+
+def test_a_fit_that_is_no_number_is_said(monkeypatch):
+    monkeypatch.setattr(_engine, "fit", lambda *_, **__: _Unfitted())
+    with pytest.raises(ValueError, match="'servo' cannot be fitted to these records"):
+        close_the_loop(SERVO, DATA)
+
+
+class _Unfitted:
+    searched = SimpleNamespace(log_likelihood=-np.inf)
 
 
 def test_samples_that_are_no_numbers_never_get_that_far():
