@@ -34,19 +34,22 @@ _AT_ONCE = 6
 
 
 class Place(NamedTuple):
-    """One effect's seat: its law, the kind of port and which one, and what a parameter follows.
+    """One effect's seat: its law, the kind of port and which one, and what its strength follows.
 
     Attributes:
         law: index into the library.
         port: "input", "force", "output" or "parameter".
         where: of the input, coordinate, output or parameter.
-        schedule: index of the schedule a parameter follows.
+        schedule: index of the schedule that a parameter, or a modulated effect, follows.
+        modulated: whether an effect on a signal is multiplied by the schedule: beside the same
+            effect of constant strength, one whose strength is a straight line over κ.
     """
 
     law: int
     port: str
     where: int
     schedule: int = 0
+    modulated: bool = False
 
 
 class Trial(NamedTuple):
@@ -69,12 +72,13 @@ def port_name(structure: AbstractPortedStructure, place: Place, schedules: Seque
         place: the effect's seat.
         schedules: names of the schedules.
     """
+    over = f" over {schedules[place.schedule]}" if place.modulated else ""
     if place.port == "input":
-        return f"input {structure.input_names[place.where]}"
+        return f"input {structure.input_names[place.where]}{over}"
     if place.port == "force":
-        return f"force at {structure.coordinate_names[place.where]}"
+        return f"force at {structure.coordinate_names[place.where]}{over}"
     if place.port == "output":
-        return f"output {structure.output_names[place.where]}"
+        return f"output {structure.output_names[place.where]}{over}"
     return f"{structure.parameter_names[place.where]} over {schedules[place.schedule]}"
 
 
@@ -116,6 +120,25 @@ def places_of(
     return found
 
 
+def modulated_places(
+    laws: Sequence[AbstractLaw], taken: Sequence[Place], schedules: Sequence[str]
+) -> list[Place]:
+    """The effects of a model once more, their strength following what was measured.
+
+    Args:
+        laws: the library.
+        taken: seats of the model's effects.
+        schedules: names of what may be followed.
+    """
+    measured = [index for index, name in enumerate(schedules) if name != "time"]
+    return [
+        place._replace(schedule=schedule, modulated=True)
+        for place in taken
+        if place.port != "parameter" and not laws[place.law].whole
+        for schedule in measured
+    ]
+
+
 def slots_of(structure: AbstractPortedStructure, places: Sequence[Place], schedules: int) -> Slots:
     """Arrays that say which effect sits where.
 
@@ -130,10 +153,11 @@ def slots_of(structure: AbstractPortedStructure, places: Sequence[Place], schedu
         "output": np.zeros((SLOTS, len(structure.output_names))),
         "parameter": np.zeros((SLOTS, len(structure.parameter_names))),
     }
-    follow = np.zeros((SLOTS, schedules))
+    follow, modulated = np.zeros((SLOTS, schedules)), np.zeros(SLOTS)
     for slot, place in enumerate(places):
         arrays[place.port][slot, place.where] = 1.0
-        if place.port == "parameter":
+        modulated[slot] = float(place.modulated)
+        if place.port == "parameter" or place.modulated:
             follow[slot, place.schedule] = 1.0
     return Slots(
         laws=tuple(place.law for place in places),
@@ -142,6 +166,7 @@ def slots_of(structure: AbstractPortedStructure, places: Sequence[Place], schedu
         output=jnp.asarray(arrays["output"]),
         parameter=jnp.asarray(arrays["parameter"]),
         schedule=jnp.asarray(follow),
+        modulated=jnp.asarray(modulated),
     )
 
 

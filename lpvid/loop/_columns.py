@@ -159,9 +159,11 @@ def _injections(
     """For each shape, one injection for each amplitude and direction."""
     if place.port == "parameter":
         return [[_varied(trace, place, varying)]]
-    every = zip(
-        *regressors(trace.setting, place, shapes, trace.signals, trace.records), strict=True
-    )
+    along_record = regressors(trace.setting, place, shapes, trace.signals, trace.records)
+    if place.modulated:
+        follow = np.asarray(trace.records.schedules)[None, :, place.schedule, None]
+        along_record = tuple(part * follow for part in along_record)
+    every = zip(*along_record, strict=True)
     if place.port == "output":
         return [_sensed(trace, place.where, sensed) for _, _, sensed in every]
     nu, directions = trace.records.u.shape[1], trace.unknowns.amplitude.shape[2]

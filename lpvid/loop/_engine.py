@@ -54,7 +54,9 @@ def close_the_loop(
     Its parameters are started and fitted from the records; the predictor's residual is
     tested against every law of the library at every port; the best few are refitted, their shapes
     free, and only what predicts held-out data better is added; at most three effects, each
-    questioned again once another is in.
+    questioned again once another is in. Where scheduling signals are measured, an effect that is
+    in is also tested for a strength that follows them: "coulomb, force at joint 2 over kappa1" is
+    the slope over κ, from −1 at its least to 1 at its largest, beside the level.
 
     Not for `jit`, `vmap` or `grad`: what it does depends on what it finds. The predictor inside is
     compiled once for each set of laws.

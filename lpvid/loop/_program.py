@@ -79,7 +79,8 @@ class Slots(eqx.Module):
         force: 1 at the coordinate it acts on (slot, coordinate).
         output: 1 at the output it acts on (slot, ny).
         parameter: 1 at the parameter it lets vary (slot, parameter).
-        schedule: 1 at the schedule that the parameter follows (slot, schedule).
+        schedule: 1 at the schedule that the parameter or the effect follows (slot, schedule).
+        modulated: 1 where the effect is multiplied by its schedule (slot,).
     """
 
     laws: tuple[int, ...] = eqx.field(static=True)
@@ -88,6 +89,7 @@ class Slots(eqx.Module):
     output: Float[Array, "slot ny"]
     parameter: Float[Array, "slot parameter"]
     schedule: Float[Array, "slot schedule"]
+    modulated: Float[Array, " slot"]
 
 
 class Unknowns(eqx.Module):
@@ -217,7 +219,7 @@ def trace(
             states @ M.C.T + still @ M.D.T,
         )
 
-    def contributions(M: Sampled, begin, end, memory, u, history, time, since):
+    def contributions(M: Sampled, begin, end, memory, u, history, time, since, share):
         """What the effects add on the way (fraction, drive), to outputs (ny,), their memory."""
         shares = jnp.asarray(FRACTIONS)[:, None]
         path = read(M, (1.0 - shares) * begin[None] + shares * end[None], u)
@@ -253,7 +255,7 @@ def trace(
                 memory[slot],
                 jnp.asarray(fine),
             )
-            total = values @ unknowns.amplitude[slot]
+            total = share[slot] * (values @ unknowns.amplitude[slot])
             pushed = (slots.force[slot][None, :, None] * total[:, None, :]).reshape(
                 total.shape[0], -1
             )
@@ -272,7 +274,9 @@ def trace(
 
     def step(carry, fraction):
         x, memory, drive = carry
-        u, y, history, time, since, weight, kappa_weight, first, which, sees, ends, added = fraction
+        u, y, history, share, time, since, weight, kappa_weight, first, which, sees, ends, added = (
+            fraction
+        )
         M = _at(matrices, weight)
         L = jnp.tensordot(kappa_weight, gain, axes=1)
         x = jnp.where(first > 0.0, unknowns.start[which], x)
@@ -282,7 +286,7 @@ def trace(
         # Laws are read on the way that the model takes by itself, with the last forces.
         free = M.transition @ x + M.drive @ held
         along, sensed, following = contributions(
-            M, x, free + M.drive @ drive, memory, u, history, time, since
+            M, x, free + M.drive @ drive, memory, u, history, time, since, share
         )
         level, change = moments(along)
         error = sees * (y - (M.C @ x + M.D @ (u + level[:nu]) + sensed + added.output))
@@ -296,9 +300,11 @@ def trace(
     def spread(array):
         return jnp.repeat(array, substeps, axis=0)
 
+    follow = records.schedules @ slots.schedule.T
+    shares = 1.0 + slots.modulated[None] * (follow - 1.0)
     place = jnp.tile(jnp.arange(float(substeps)), records.u.shape[0])
     fractions = (
-        *map(spread, (records.u, records.y, records.history)),
+        *map(spread, (records.u, records.y, records.history, shares)),
         spread(records.time) + fine * place,
         fine * place,
         *map(spread, (node_weights, records.weights)),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.stats
 
-from lpvid.loop._candidates import Place, places_of
+from lpvid.loop._candidates import Place, modulated_places, places_of
 from lpvid.loop._columns import along, force_columns, tests_at, trial_columns
 from lpvid.loop._compare import better, sample_likelihood
 from lpvid.loop._program import Records
@@ -53,7 +53,9 @@ def rank(fitted: Fitted, records: Records, schedules: Sequence[str]) -> Ranking:
     setting = fitted.setting
     trace = along(setting, records, fitted.slots, fitted.unknowns, fitted.gain)
     taken = set(fitted.places)
-    places = [p for p in places_of(setting.structure, setting.laws, schedules) if p not in taken]
+    places = places_of(setting.structure, setting.laws, schedules)
+    places += modulated_places(setting.laws, fitted.places, schedules)
+    places = [place for place in places if place not in taken]
     tried: dict[Place, int] = {}
     test = ScoreTest(fitted.searched.errors, fitted.searched.columns)
     samples = fitted.searched.errors.shape[0]
@@ -62,7 +64,8 @@ def rank(fitted: Fitted, records: Records, schedules: Sequence[str]) -> Ranking:
         tried[trial.place] = tried.get(trial.place, 0) + 1
         law = setting.laws[trial.place.law]
         directions = columns.shape[2] // len(law.amplitudes)
-        positive = np.array([a.positive and directions == 1 for a in law.amplitudes])
+        signed = directions == 1 and not trial.place.modulated
+        positive = np.array([a.positive and signed for a in law.amplitudes])
         if law.whole:
             positive = np.ones(len(law.amplitudes), bool)
         scored = test.score(columns, np.repeat(positive, directions))

@@ -117,7 +117,7 @@ def free_unknowns(
             for number, amplitude in enumerate(law.amplitudes):
                 for direction in range(along):
                     where.append(offset + (slot * AMPLITUDES + number) * directions + direction)
-                    signed = amplitude.positive and along == 1
+                    signed = amplitude.positive and along == 1 and not place.modulated
                     lower.append(0.0 if signed else -np.inf)
                     upper.append(np.inf)
         least, greatest = law.bounds(scale) if law.shapes else (np.zeros(0), np.zeros(0))

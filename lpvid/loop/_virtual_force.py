@@ -91,6 +91,8 @@ def _contribution(own: Along, fitted: Fitted, slot: int, place: Place) -> np.nda
     # At the samples, not the mean over the steps, in which a velocity may turn.
     _, _, sensed = regressors(fitted.setting, place, shape, own.signals, own.records)
     values = sensed[0]
+    if place.modulated:
+        values = values * np.asarray(own.records.schedules)[:, place.schedule, None]
     return values @ np.asarray(fitted.unknowns.amplitude[slot, : values.shape[1], 0])
 
 

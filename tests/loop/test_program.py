@@ -153,13 +153,14 @@ def test_derivatives_by_injected_signals(short):
     assert still.state.shape == (40, 4) and still.output.shape == (40, 2)
 
 
-def test_a_candidate_is_tested_in_the_direction_it_would_take():
+@pytest.mark.parametrize("place", [PLACES[1], PLACES[1]._replace(modulated=True)])
+def test_a_candidate_is_tested_in_the_direction_it_would_take(place):
     setting, records, slots, unknowns = _model(_data(40), ())
     gain = jnp.full((1, 4, 2), 0.1)
     base = along(setting, records, slots, unknowns, gain)
-    (_, columns), *_ = trial_columns(base, [PLACES[1]])
+    (_, columns), *_ = trial_columns(base, [place])
     # The derivative at an amplitude of zero with the law in the program itself.
-    seated = slots_of(setting.structure, [PLACES[1]], 1)
+    seated = slots_of(setting.structure, [place], 1)
     size = unknowns.theta.size
     expected = sensitivities(setting, records, seated, unknowns, gain, np.array([size]))[1]
     size = np.abs(expected).max()
