@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from lpvid.models import StateSpace
+from lpvid.models import StateSpace, runge_kutta_step
 
 KineticEnergy: TypeAlias = Callable[[Array, Array, Any], Array]
 PotentialEnergy: TypeAlias = Callable[[Array, Any], Array]
@@ -172,23 +172,6 @@ def linearise(
     a, b = jax.jacfwd(dynamics, (0, 1))(state, inputs)
     c, d = jax.jacfwd(output, (0, 1))(state, inputs)
     return StateSpace(a, b, c, d)
-
-
-def runge_kutta_step(dynamics: Dynamics, state: Array, held: Array, step: Array) -> Array:
-    """One step of the classical Runge–Kutta method, the input held."""
-    # The four stages as a loop: the dynamics are traced and compiled once instead of four times.
-    look_ahead = jnp.array([0.0, 0.5, 0.5, 1.0])
-    weights = jnp.array([1.0, 2.0, 2.0, 1.0]) / 6.0
-
-    def stage(carry, coefficients):
-        slope, increment = carry
-        ahead, weight = coefficients
-        slope = dynamics(state + step * ahead * slope, held)
-        return (slope, increment + weight * slope), None
-
-    zero = jnp.zeros_like(state)
-    (_, increment), _ = jax.lax.scan(stage, (zero, zero), (look_ahead, weights))
-    return state + step * increment
 
 
 def _cholesky_solve(matrix: Array, right: Array) -> Array:

@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from lpvid._results import Status
 from lpvid.data import IOData
-from lpvid.mechanics._lagrangian import runge_kutta_step
 from lpvid.mechanics._sampled_control import OpenLoop, SampledController
 from lpvid.mechanics._single_link_arm import SENSORS, TRAVEL, SingleLinkFlexibleArm
 from lpvid.mechanics._single_link_effects import (
@@ -20,6 +19,7 @@ from lpvid.mechanics._single_link_effects import (
     InputDelay,
     backlash_dynamics,
 )
+from lpvid.models import runge_kutta_step
 
 
 class SingleLinkMotion(eqx.Module):

@@ -33,10 +33,12 @@ from lpvid.models._interconnect import series as series
 from lpvid.models._lpv import LPVStateSpace as LPVStateSpace
 from lpvid.models._mechanical_structure import MechanicalStructure as MechanicalStructure
 from lpvid.models._modal_structure import ModalStructure as ModalStructure
+from lpvid.models._nonlinear_model import NonlinearModel as NonlinearModel
 from lpvid.models._realisations import balance as balance
 from lpvid.models._realisations import balancing as balancing
 from lpvid.models._realisations import gramians as gramians
 from lpvid.models._realisations import modal_form as modal_form
+from lpvid.models._runge_kutta import runge_kutta_step as runge_kutta_step
 from lpvid.models._schedule_hold import AbstractScheduleHold as AbstractScheduleHold
 from lpvid.models._schedule_hold import HeldSchedule as HeldSchedule
 from lpvid.models._schedule_hold import LinearSchedule as LinearSchedule
@@ -52,6 +54,11 @@ from lpvid.models._spline import Spline as Spline
 from lpvid.models._spline import SplineBasis as SplineBasis
 from lpvid.models._state_space import Modes as Modes
 from lpvid.models._state_space import StateSpace as StateSpace
+from lpvid.models._steps import AbstractSteps as AbstractSteps
+from lpvid.models._steps import can_step as can_step
+from lpvid.models._steps import one_step_predictor as one_step_predictor
+from lpvid.models._steps import steps_of as steps_of
+from lpvid.models._steps import takes_schedule as takes_schedule
 from lpvid.models._structured_model import StructuredModel as StructuredModel
 from lpvid.models._structures import AbstractStructure as AbstractStructure
 from lpvid.models._structures import FreeStructure as FreeStructure

@@ -256,7 +256,11 @@ class LPVStateSpace(eqx.Module):
     def _warn_outside(self, point: Array) -> None:
         if isinstance(point, Tracer) or isinstance(self.kappa_low, Tracer):
             return
-        share = float(np.mean(~np.asarray(self.is_inside(point))))
+        inside = self.is_inside(point)
+        # Under jit, what is computed from constants is traced too.
+        if isinstance(inside, Tracer):
+            return
+        share = float(np.mean(~np.asarray(inside)))
         if share > 0:
             flat = self.n_scheduling == 1 or self.hull is None
             warnings.warn(

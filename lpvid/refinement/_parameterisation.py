@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lpvid.data import IOData
-from lpvid.models import AbstractStructure, StateSpace, StructuredModel
+from lpvid.models import AbstractStructure, StateSpace, StructuredModel, one_step_predictor
 
 Values = Float[Array, " value"]
 
@@ -118,8 +118,7 @@ class LinearParameterisation(AbstractParameterisation):
     def names(self) -> tuple[str, ...]:
         """The structure's names, then `K[i,j]`."""
         nx, _, ny = self.sizes
-        gains = (f"K[{i},{j}]" for i in range(nx) for j in range(ny)) if self.gain else ()
-        return (*self.structure.parameter_names, *gains)
+        return (*self.structure.parameter_names, *(gain_names(nx, ny) if self.gain else ()))
 
     @property
     def n_states(self) -> int:
@@ -153,14 +152,7 @@ class LinearParameterisation(AbstractParameterisation):
         """The predictor: A − K C, [B − K D, K], C, [D, 0] where K is estimated."""
         model = self.matrices(values)
         gain = self.innovation_gain(values)
-        if gain is None:
-            return model
-        return StateSpace(
-            model.A - gain @ model.C,
-            jnp.concatenate([model.B - gain @ model.D, gain], axis=1),
-            model.C,
-            jnp.concatenate([model.D, jnp.zeros((model.ny, model.ny))], axis=1),
-        )
+        return model if gain is None else one_step_predictor(model, gain)
 
     def respond(self, prepared: StateSpace, record: Record, x0: Array) -> Float[Array, "time ny"]:
         """Blocked simulation of the predictor."""
@@ -211,6 +203,11 @@ class LinearParameterisation(AbstractParameterisation):
             blocks.append(units @ gain[None])
         columns = jnp.concatenate([block.reshape(nx * nx, -1) for block in blocks], axis=1).T
         return columns / self.units[:, None]
+
+
+def gain_names(nx: int, ny: int) -> tuple[str, ...]:
+    """`K[i,j]` for every entry of K."""
+    return tuple(f"K[{i},{j}]" for i in range(nx) for j in range(ny))
 
 
 def free_units(

@@ -44,18 +44,43 @@ class OutputError(AbstractPredictor):
 
 
 class Innovation(AbstractPredictor):
-    """One-step prediction x̂⁺ = A x̂ + B u + K e, e = y − C x̂ − D u, K estimated too.
+    """One-step prediction x̂⁺ = f(x̂, u) + K (y − ŷ), ŷ = h(x̂, u), with K estimated too.
 
     The maximum likelihood estimate where noise enters the plant as well, or the data come from a
-    closed loop. In continuous time K is that of the discretised model.
+    closed loop. For linear models f(x, u) = A x + B u and h(x, u) = C x + D u (in continuous time
+    K is that of the discretised model), for an `LPVStateSpace` or a `GrayBoxLPV` the same with the
+    matrices at every sample's κ (of a continuous-time model discretised there), for others their
+    `step`. K is one constant matrix, along moving schedules and over all records too: there and in
+    nonlinear models the best gain may vary, and a constant one is then a compromise, which shows
+    in a residual that is not quite white.
+
+    There is no `shooting`: an unstable plant needs no pieces, because y and not the model carries
+    the motion wherever K makes the predictor stable (for matrices, A − K C). Give a `gain` that
+    does at the start, such as a Kalman gain of the model linearised there; where the start is too
+    poor for one, refine with `OutputError(shooting=...)` first. Pieces with states of their own
+    would leave K undetermined until they meet.
+
+    A module of one's own needs `n_states` (or `nx`) and `step(x, u, *, dt)` → (state one sample
+    later, output at this one), `kappa` as one more keyword where it depends on a schedule, written
+    with `jax.numpy` and smooth in the state and in the module's arrays. A plant with ẋ = f(x, u)
+    gets all that from `NonlinearModel`.
 
     Attributes:
         gain: where K starts, (nx, ny); by default the innovation gain of the fit that is refined,
-            or zero. An unstable model needs one that makes A − K C stable.
+            or zero.
+
+    Source: Ljung (1999), System Identification, sections 3.2 and 7.4, on the innovation form.
 
     Example:
-        >>> Innovation().gain is None
-        True
+        >>> import equinox as eqx
+        >>> class Tank(eqx.Module):
+        ...     outflow: jax.Array
+        ...     n_states = 1
+        ...     def step(self, x, u, *, dt):
+        ...         return x + dt * (u - self.outflow * jnp.sqrt(1.0 + x)), x
+        >>> Tank(jnp.asarray(1.0)).step(jnp.zeros(1), jnp.full(1, 2.0), dt=0.1)[0].tolist()
+        [0.1]
+        >>> predictor = Innovation(gain=[[0.4]])
     """
 
     gain: Float[Array, "nx ny"] | None = None

@@ -1,9 +1,9 @@
 """Which kind of model was given, and where its values start."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +12,21 @@ from jaxtyping import Array, Float
 
 from lpvid.data import IOData
 from lpvid.identify import ContinuousTimeFit, Fit, MechanicalFit, StepResponseFit
-from lpvid.models import FreeStructure, StateSpace, StructuredModel, balancing
-from lpvid.refinement._modules import ModuleParameterisation, needs_schedule
+from lpvid.models import (
+    FreeStructure,
+    StateSpace,
+    StructuredModel,
+    balancing,
+    can_step,
+    steps_of,
+)
+from lpvid.refinement._modules import (
+    ModuleParameterisation,
+    can_be_corrected,
+    is_module,
+    needs_schedule,
+    simulates,
+)
 from lpvid.refinement._parameterisation import (
     AbstractParameterisation,
     LinearParameterisation,
@@ -56,12 +69,12 @@ def recognise(model: Any, data: IOData, predictor: AbstractPredictor) -> Start:
         return _black_box(model, data, estimates_gain, gain, feedthrough)
     if isinstance(model, StructuredModel):
         return _structured(model, data, estimates_gain, gain)
-    if isinstance(model, eqx.Module) and callable(getattr(model, "simulate", None)):
-        return _module(model, data, estimates_gain)
+    if is_module(model):
+        return _module(model, data, estimates_gain, gain)
     raise ValueError(
         f"model: {type(model).__name__} cannot be refined; give a StateSpace, a Fit, a "
-        "StructuredModel, an LPVStateSpace, a GrayBoxLPV or an eqx.Module with "
-        "simulate(u=, dt=, x0=)."
+        "StructuredModel, an LPVStateSpace, a GrayBoxLPV, a NonlinearModel (of any plant with "
+        "ẋ = f(x, u)), or an eqx.Module with simulate(u=, dt=, x0=) or step(x, u, dt=)."
     )
 
 
@@ -163,9 +176,14 @@ def _per_record(data: IOData) -> list[np.ndarray]:
     return np.split(np.asarray(data.kappa), np.cumsum(data.lengths)[:-1])
 
 
-def _module(model: Any, data: IOData, estimates_gain: bool) -> Start:
-    if estimates_gain:
-        raise ValueError("predictor: Innovation() is for linear models of constant matrices.")
+def _module(model: Any, data: IOData, estimates_gain: bool, gain: Array | None) -> Start:
+    name = type(model).__name__
+    if estimates_gain and not can_be_corrected(model):
+        raise ValueError(
+            f"predictor: Innovation() corrects the state after every sample, and {name} offers "
+            "simulate alone. Give it step(x, u, dt=) -> (state one sample later, output now), "
+            "describe it as a NonlinearModel, or use OutputError()."
+        )
     if data.kappa is None and needs_schedule(model):
         raise ValueError("data: an LPV model needs the scheduling; give kappa= to IOData.")
     dt = getattr(model, "dt", 0.0)
@@ -175,16 +193,41 @@ def _module(model: Any, data: IOData, estimates_gain: bool) -> Start:
             "check the data's sample time."
         )
     states = int(getattr(model, "n_states", getattr(model, "nx", 0)))
+    if estimates_gain and not states:
+        raise ValueError(
+            f"model: {name} has a step, but n_states does not say how many states it has; name "
+            "their number."
+        )
     kind = ModuleParameterisation(model, data.dt, states, _schedules(data))
     if not kind.names:
         raise ValueError("model: it holds no inexact arrays, so there is nothing to estimate.")
     values = kind.start()
+    _check_module(kind, values, data, estimates_gain)
+    if estimates_gain:
+        kind = replace(kind, outputs=data.ny)
+        values = jnp.concatenate([values, _gain(gain, states, data.ny).reshape(-1)])
+    return Start(kind, values)
+
+
+def _check_module(
+    kind: ModuleParameterisation, values: Array, data: IOData, estimates_gain: bool
+) -> None:
+    """Raise where shapes do not fit, seen on two samples."""
+    states = kind.states
     kappa = None if data.kappa is None else data.kappa[:2]
     record = Record(data.u[:2], data.y[:2], kappa)
+    if can_step(kind.model) and (estimates_gain or not simulates(kind.model)):
+        along = steps_of(kind.model, u=record.u, kappa=kappa, dt=data.dt)
+        now = jax.tree.map(lambda signal: signal[0], along.signals)
+        after, _ = jax.eval_shape(along.step, jnp.zeros(states), now)
+        if after.shape != (states,):
+            raise ValueError(
+                f"model: its step leads from {states} states to shape {after.shape}; ({states},) "
+                "is needed, n_states (or nx) long."
+            )
     shape = jax.eval_shape(kind.respond, values, record, jnp.zeros(states))
     if shape.shape != (2, data.ny):
         raise ValueError(
-            f"model: its simulate gives {shape.shape} for two samples; this data needs "
+            f"model: its output has shape {shape.shape} for two samples; this data needs "
             f"(2, {data.ny})."
         )
-    return Start(kind, values)

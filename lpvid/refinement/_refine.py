@@ -62,9 +62,10 @@ def refine(
             returned, a `StateSpace` (discrete at the data's sample time, or continuous: zero-order
             hold), `StructuredModel`,
             `LPVStateSpace` (its coefficients, along the data's `kappa`), `GrayBoxLPV` (its
-            parameters), or any `eqx.Module` with `simulate(u=, dt=, x0=)`, and `kappa=` where it
-            takes one, whose inexact arrays are the parameters and whose `n_states`
-            (or `nx`) says how long x0 is; without it, x0 is not passed.
+            parameters), `NonlinearModel`, or any `eqx.Module` with `simulate(u=, dt=, x0=)` or
+            `step(x, u, dt=)` (which `Innovation` needs), and `kappa=` where it takes one, whose
+            inexact arrays are the parameters and whose `n_states` (or `nx`) says how long x0 is;
+            without it, x0 is not passed.
         data: one or several records.
         predictor: `OutputError()` by default, or `Innovation()`.
         loss: `SquaredLoss()` by default, or `HuberLoss()`.

@@ -27,7 +27,8 @@ class Refined(eqx.Module):
         x0: initial states, (record, nx).
         output_offset: constant to add to the model's outputs, (ny,), one of the parameters where
             it is estimated; None where there is none.
-        innovation_gain: K, (nx, ny), or None where it was not estimated.
+        innovation_gain: K, (nx, ny), constant along moving schedules too; None where it was not
+            estimated.
         noise_covariance: of the residual, corrected for the unknowns estimated, (ny, ny).
         residual: y − ŷ, records one after the other as in the data, (time, ny).
         cost: the loss; of `SquaredLoss` a negative log likelihood up to a constant.

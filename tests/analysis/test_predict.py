@@ -86,9 +86,12 @@ def test_errors_over_horizons_are_those_of_predict():
     errors = horizon_errors(MODEL, u=U, y=Y, gain=K, x0=X0, lengths=LENGTHS)
     assert errors.rmse.shape == errors.fit.shape == (5, 2)
     assert errors.horizons.tolist() == [1.0, 2.0, 3.0, 5.0, np.inf]
-    for horizon, rmse in zip((1, 2, 3, 5, None), errors.rmse, strict=True):
+    off_mean = np.concatenate([part - part.mean(axis=0) for part in (Y[:25], Y[25:])])
+    for horizon, rmse, fit in zip((1, 2, 3, 5, None), errors.rmse, errors.fit, strict=True):
         found = predict(MODEL, u=U, y=Y, gain=K, x0=X0, horizon=horizon, lengths=LENGTHS)
         np.testing.assert_allclose(rmse, np.sqrt(np.mean((Y - found) ** 2, axis=0)), rtol=1e-12)
+        expected = 1.0 - np.linalg.norm(Y - found, axis=0) / np.linalg.norm(off_mean, axis=0)
+        np.testing.assert_allclose(fit, 100.0 * expected, rtol=1e-9)
     assert horizon_errors(MODEL, u=U, y=Y).rmse.shape == (1, 2)
 
 
