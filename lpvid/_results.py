@@ -66,6 +66,14 @@ class Status(eqx.Enumeration):
         "definite one is returned. Check signs, the pairing of inputs with outputs, and the length "
         "of the records."
     )
+    infeasible = (
+        "The margins asked for were not reached within the bounds; the design nearest to them is "
+        "returned. Widen the bounds, give other starts, or ask for less."
+    )
+    close_poles = (
+        "Poles nearly coincide, so that single modes mean little: their parts cancel. Reduce with "
+        "balanced_truncation, or identify at a lower order."
+    )
     infinite_norm = (
         "The system has a pole on the stability boundary, so its norm is infinite. Remove the "
         "marginal mode or add damping."
