@@ -134,6 +134,7 @@ def minimise(
     *,
     max_steps: int = 50,
     tolerance: float = 1e-9,
+    stop_if_stuck: bool = False,
 ) -> Solution:
     """Minimise a smooth function by L-BFGS (zoom line search) from one start; never raises.
 
@@ -144,6 +145,7 @@ def minimise(
         start: where to begin.
         max_steps: limit on the steps.
         tolerance: on the gradient's norm.
+        stop_if_stuck: end when a line search fails, as at a kink, where more steps only cost time.
 
     Returns:
         The better one of the last point and the start, its cost (infinite where it is not finite)
@@ -153,7 +155,14 @@ def minimise(
         >>> minimise(lambda x: jnp.sum((x - 3.0) ** 2), jnp.zeros(1)).value.round(6).tolist()
         [3.0]
     """
-    solver = jaxopt.LBFGS(loss, maxiter=max_steps, tol=tolerance, history_size=12, jit=True)
+    solver = jaxopt.LBFGS(
+        loss,
+        maxiter=max_steps,
+        tol=tolerance,
+        history_size=12,
+        stop_if_linesearch_fails=stop_if_stuck,
+        jit=True,
+    )
     value, state = solver.run(start)
     cost, first = loss(value), loss(start)
     # A line search that fails may leave a worse point than it came from.

@@ -9,8 +9,8 @@ PACKAGE = Path(__file__).resolve().parents[1] / "lpvid"
 # Each room imports from rooms to its left and from itself.
 ORDER = (
     "_runtime _types _files _results _linalg data effects _solve _batch models analysis mechanics "
-    "identify refinement restructure interpolate reduce loop plot io montecarlo study report "
-    "commands __main__"
+    "identify refinement restructure interpolate reduce control loop plot io montecarlo study "
+    "report commands __main__"
 ).split()
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
 MODULES.remove(Path("__init__.py"))

@@ -7,14 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from lpvid._results import Status
+from lpvid.control import ClosedLoopMotion
 from lpvid.data import IOData
 from lpvid.loop._assess import free_run
 from lpvid.loop._ported import AbstractPortedStructure
-from lpvid.loop._program import Records
+from lpvid.loop._program import Feedback, Records
 from lpvid.loop._records import records_of
 from lpvid.loop._rounds import held_out_errors
 from lpvid.loop._search import run
 from lpvid.loop._tune import Fitted
+from lpvid.mechanics import SampledController
 
 
 class LoopModel(NamedTuple):
@@ -94,6 +97,67 @@ class LoopModel(NamedTuple):
             ValueError: channels or sample time do not suit.
         """
         return np.asarray(data.y) - held_out_errors(self.fitted, self._records(data))
+
+    def simulate_closed_loop(
+        self,
+        controller: SampledController,
+        *,
+        reference: Float[ArrayLike, "time *nr"],
+        kappa: Float[ArrayLike, "time *nk"] | None = None,
+        initial_states: Float[ArrayLike, " state"] | None = None,
+    ) -> ClosedLoopMotion:
+        """Motion under a sampled controller, effects included, from rest.
+
+        The controller reads the model's outputs at every sample; its command acts at once and is
+        held until the next one.
+
+        Args:
+            controller: any `SampledController`.
+            reference: set-points (time,) or (time, nr), at the model's sample time.
+            kappa: scheduling signals (time,) or (time, nk) of a model that has any.
+            initial_states: in the structure's states; zero if `None`.
+
+        Raises:
+            ValueError: shapes that do not suit, or an output that depends on the command at once.
+        """
+        wanted = jnp.asarray(reference, float)
+        wanted = wanted[:, None] if wanted.ndim == 1 else wanted
+        samples = wanted.shape[0]
+        structure, unknowns = self.structure, self.fitted.unknowns
+        theta, node = unknowns.theta, jnp.asarray(self.nodes[0])
+        if np.any(np.asarray(structure.ports(theta, node).D)):
+            raise ValueError(
+                "The model has feedthrough: its output depends on the command that is computed "
+                "from it. Use a structure without."
+            )
+        still = IOData(
+            u=np.zeros((samples, len(structure.input_names))),
+            y=np.zeros((samples, len(structure.output_names))),
+            dt=self.fitted.setting.dt,
+            kappa=kappa,
+        )
+        states = unknowns.start.shape[1]
+        start = jnp.zeros(states) if initial_states is None else jnp.asarray(initial_states, float)
+        if start.shape != (states,):
+            raise ValueError(f"initial_states: {states} numbers are needed, got {start.shape}.")
+        out = run(
+            self.fitted.setting,
+            self._records(still),
+            self.fitted.slots,
+            eqx.tree_at(lambda tree: tree.start, unknowns, start[None]),
+            jnp.zeros_like(self.fitted.gain),
+            Feedback(controller, wanted),
+        )
+        finite = jnp.all(jnp.isfinite(out.innovations))
+        return ClosedLoopMotion(
+            reference=wanted,
+            u=out.u,
+            # Against measurements of zero.
+            y=-out.innovations,
+            states=out.before,
+            status=Status.where(finite, Status.successful, Status.nonfinite),
+            dt=self.fitted.setting.dt,
+        )
 
     def _records(self, data: IOData) -> Records:
         structure, dt = self.structure, self.fitted.setting.dt

@@ -10,6 +10,7 @@ from lpvid.effects import HISTORY, MEMORY, AbstractLaw, Signals
 from lpvid.loop._discretise import Sampled, sampled_at
 from lpvid.loop._path import moments, path_of, path_rule
 from lpvid.loop._ported import AbstractPortedStructure
+from lpvid.mechanics import SampledController
 
 SLOTS = 3
 """Effects that a model can hold at once."""
@@ -120,10 +121,23 @@ class Injection(eqx.Module):
     output: Float[Array, "*column time ny"]
 
 
+class Feedback(eqx.Module):
+    """A sampled controller in place of the recorded inputs.
+
+    Attributes:
+        controller: sees the model's outputs at every sample.
+        reference: what it is to follow (time, nr).
+    """
+
+    controller: SampledController
+    reference: Float[Array, "time nr"]
+
+
 class Trace(eqx.Module):
     """What the predictor went through.
 
     Attributes:
+        u: inputs, recorded or a controller's (time, nu).
         innovations: y − ŷ (time, ny).
         before: state before the sample was seen (time, state).
         state: state with the sample seen (time, state).
@@ -132,6 +146,7 @@ class Trace(eqx.Module):
         memory: internal states of the effects before the sample (time, slot, memory).
     """
 
+    u: Float[Array, "time nu"]
     innovations: Float[Array, "time ny"]
     before: Float[Array, "time state"]
     state: Float[Array, "time state"]
@@ -185,6 +200,7 @@ def trace(
     unknowns: Unknowns,
     gain: Float[Array, "node state ny"],
     injection: Injection,
+    feedback: Feedback | None = None,
 ) -> Trace:
     """Run the predictor over the records.
 
@@ -199,6 +215,7 @@ def trace(
         unknowns: parameters, amplitudes, shapes, initial states.
         gain: L at the nodes of κ (node, state, ny).
         injection: added signals, usually zero.
+        feedback: a controller whose commands take the inputs' place, for a single record.
     """
     laws = [path_of(setting.laws[law]) for law in slots.laws]
     # Without effects one step is exact.
@@ -272,16 +289,31 @@ def trace(
             total = one(slot, evaluate, total)
         return total
 
+    def command(M: Sampled, x, memory, drive, clock, sees, sample, commanded):
+        """Inputs as a controller wants them, which sees the outputs that the last ones leave."""
+        assert feedback is not None
+        u, history, state = commanded
+        free = M.transition @ x + M.drive @ (jnp.concatenate([u, idle[nu:]]) + drive)
+        _, sensed, _ = contributions(M, x, free, memory, u, history, *clock)
+        read = M.C @ x + M.D @ u + sensed
+        following, sent = feedback.controller.step(state, feedback.reference[sample], read)
+        fresh = (sent, jnp.concatenate([sent[None], history[:-1]]), following)
+        kept = jax.tree.map(lambda new, old: jnp.where(sees, new, old), fresh, commanded)
+        return kept[0], kept[1], kept
+
     def step(carry, fraction):
-        x, memory, drive = carry
-        u, y, history, share, time, since, weight, kappa_weight, first, which, sees, ends, added = (
-            fraction
-        )
+        x, memory, drive, commanded = carry
+        u, y, history, share, time, since, weight, kappa_weight, *marks, added = fraction
+        first, which, which_sample, sees, ends = marks
         M = _at(matrices, weight)
         L = jnp.tensordot(kappa_weight, gain, axes=1)
         x = jnp.where(first > 0.0, unknowns.start[which], x)
         memory = jnp.where(first > 0.0, records.memory[which], memory)
         drive = jnp.where(first > 0.0, 0.0, drive)
+        if feedback is not None:
+            u, history, commanded = command(
+                M, x, memory, drive, (time, since, share), sees > 0.0, which_sample, commanded
+            )
         held = jnp.concatenate([u, idle[nu:]])
         # Laws are read on the way that the model takes by itself, with the last forces.
         free = M.transition @ x + M.drive @ held
@@ -294,7 +326,8 @@ def trace(
         moved = free + M.drive @ level + M.ramp @ change + M.transition @ correction
         # Added at the end, so that a sensitivity sees it as one more force over the sample.
         moved = moved + ends * added.state
-        return (moved, following, level + change), (error, x, x + correction, moved, level, memory)
+        carry = (moved, following, level + change, commanded)
+        return carry, (u, error, x, x + correction, moved, level, memory)
 
     # Every sample is a few fractions, of which the first sees the measurement.
     def spread(array):
@@ -310,19 +343,24 @@ def trace(
         *map(spread, (node_weights, records.weights)),
         jnp.where(place == 0.0, spread(records.first), 0.0),
         spread(records.record),
+        spread(jnp.arange(records.u.shape[0])),
         jnp.where(place == 0.0, 1.0, 0.0),
         jnp.where(place == substeps - 1.0, 1.0, 0.0),
         jax.tree.map(spread, injection),
     )
     idle = jnp.zeros(nu + coordinates * directions)
-    start = (unknowns.start[0], jnp.zeros((SLOTS, MEMORY)), idle)
+    commanded = None
+    if feedback is not None:
+        commanded = (idle[:nu], jnp.zeros((HISTORY, nu)), feedback.controller.initial())
+    start = (unknowns.start[0], jnp.zeros((SLOTS, MEMORY)), idle, commanded)
     _, out = lax.scan(step, start, fractions)
-    error, before, seen, moved, level, memory = out
+    inputs, error, before, seen, moved, level, memory = out
 
     def at_samples(array, offset=0):
         return array[offset::substeps]
 
     return Trace(
+        u=at_samples(inputs),
         innovations=at_samples(error),
         before=at_samples(before),
         state=at_samples(seen),

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from lpvid.loop._compare import whitener
 from lpvid.loop._program import (
+    Feedback,
     Injection,
     Records,
     Setting,
@@ -61,6 +62,7 @@ def run(
     slots: Slots,
     unknowns: Unknowns,
     gain: Float[Array, "node state ny"],
+    feedback: Feedback | None = None,
 ) -> Trace:
     """The predictor's trace; the compiled form of `trace` without injection.
 
@@ -70,6 +72,7 @@ def run(
         slots: which effects.
         unknowns: their numbers and the model's.
         gain: L at the nodes of κ.
+        feedback: a controller in place of the recorded inputs.
     """
     return trace(
         setting,
@@ -78,6 +81,7 @@ def run(
         unknowns,
         gain,
         nothing_injected(records, unknowns.start.shape[1]),
+        feedback,
     )
 
 

@@ -4,6 +4,9 @@ Every function takes `axes=` (draw there; new ones are made otherwise) and retur
 drew on. Matplotlib is imported when the first plot is drawn, not with lpvid.
 """
 
+from lpvid.plot._control import closed_loop_response as closed_loop_response
+from lpvid.plot._control import loop_bode as loop_bode
+from lpvid.plot._control import nyquist as nyquist
 from lpvid.plot._figure import png_bytes as png_bytes
 from lpvid.plot._figure import save_figure as save_figure
 from lpvid.plot._frequency import bode as bode
@@ -18,6 +21,8 @@ from lpvid.plot._loop_findings import virtual_forces as virtual_forces
 from lpvid.plot._loop_signals import loop_residuals as loop_residuals
 from lpvid.plot._loop_signals import loop_responses as loop_responses
 from lpvid.plot._loop_signals import loop_spectra as loop_spectra
+from lpvid.plot._modal_responses import modal_reduction as modal_reduction
+from lpvid.plot._modal_responses import modal_responses as modal_responses
 from lpvid.plot._parameters import parameters as parameters
 from lpvid.plot._poles import mode_frequencies as mode_frequencies
 from lpvid.plot._poles import poles as poles
@@ -29,3 +34,4 @@ from lpvid.plot._search import scree as scree
 from lpvid.plot._stabilisation import stabilisation as stabilisation
 from lpvid.plot._time import compare as compare
 from lpvid.plot._time import records as records
+from lpvid.plot._validation import validation as validation

@@ -32,8 +32,8 @@ def coulomb(level):
     return lambda q, v, t: -level * np.tanh(v / 2e-4)
 
 
-def record(force=None, *, samples=900, noise=NOISE, seed=0, factor=None):
-    """A held random force on the mass, its position measured.
+def record(force=None, *, samples=900, noise=NOISE, seed=0, factor=None, command=None):
+    """A held force on the mass, random or a controller's, its position measured.
 
     Args:
         force: f(q, v, t) that the linear model does not have.
@@ -41,6 +41,7 @@ def record(force=None, *, samples=900, noise=NOISE, seed=0, factor=None):
         noise: standard deviation of the output's noise.
         seed: of input and noise.
         factor: of the stiffness over the record (samples,), 1 by default.
+        command: held force from the sample's number and the position there, without noise.
     """
     rng = np.random.default_rng(seed)
     u = 2.0 * np.repeat(rng.standard_normal(samples // 6 + 1), 6)[:samples]
@@ -54,6 +55,7 @@ def record(force=None, *, samples=900, noise=NOISE, seed=0, factor=None):
     x, positions = np.zeros(2), np.zeros(samples)
     for k in range(samples):
         positions[k] = x[0]
+        u[k] = u[k] if command is None else command(k, x[0])
         step = steps[factor[k]]
         for i in range(FINE):
             push = u[k] if force is None else u[k] + force(x[0], x[1], DT * (k + i / FINE))

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from lpvid.data import join
+from lpvid.control import ProportionalIntegral, set_point_following
+from lpvid.data import IOData, join
 
 from .engine_records import NOISE, closed, coulomb, record
 
@@ -64,3 +65,42 @@ def test_records_of_another_kind_are_refused(loop):
         loop.model.predict(other.replace(kappa=np.zeros(other.n_samples)))
     with pytest.raises(ValueError, match="one row for each record"):
         loop.model.simulate(other, initial_states=np.zeros((3, 2)))
+
+
+@pytest.fixture(scope="module")
+def following(loop):
+    """Set-points under integral control: reference, controller, what the mass did."""
+    reference = np.repeat(0.1 * np.array([1.0, -0.5, 0.3, 0.0]), 100)
+    proportional, integral = 2.0, 0.5
+    total = [0.0]
+
+    def command(k, position):
+        total[0] += reference[k] - position
+        return proportional * (reference[k] - position) + integral * total[0]
+
+    truth = record(coulomb(0.4), samples=400, noise=0.0, command=command)
+    return reference, ProportionalIntegral(proportional, integral, dt=1.0), truth
+
+
+def test_under_a_controller_it_does_what_the_plant_does(loop, following):
+    reference, controller, truth = following
+    motions = [
+        model.simulate_closed_loop(controller, reference=reference)
+        for model in (loop.model_before, loop.model)
+    ]
+    missed = set_point_following(
+        {"linear": motions[0], "with friction": motions[1]}, truth, reference=reference
+    ).relative_error[:, 0]
+    assert missed[1] < missed[0] / 3.0
+    assert missed[1] < 0.05
+
+
+def test_the_commands_alone_give_the_same_motion(loop, following):
+    motion = loop.model.simulate_closed_loop(following[1], reference=following[0])
+    data = IOData(u=motion.u, y=motion.y, dt=motion.dt)
+    again = loop.model.simulate(data, initial_states=np.zeros((1, 2)))
+    np.testing.assert_allclose(again, motion.y, rtol=0.0, atol=1e-9)
+    with pytest.raises(ValueError, match="initial_states: 2 numbers"):
+        loop.model.simulate_closed_loop(
+            following[1], reference=following[0], initial_states=np.zeros(3)
+        )
