@@ -7,6 +7,7 @@ _runtime.configure()
 __version__ = "0.1.0"
 
 from lpvid import analysis as analysis
+from lpvid import control as control
 from lpvid import data as data
 from lpvid import effects as effects
 from lpvid import loop as loop
@@ -14,6 +15,7 @@ from lpvid import mechanics as mechanics
 from lpvid import models as models
 from lpvid import montecarlo as montecarlo
 from lpvid import plot as plot
+from lpvid import reduce as reduce
 from lpvid import report as report
 from lpvid import study as study
 from lpvid._results import Status as Status
@@ -94,6 +96,7 @@ from lpvid.models import LPVStateSpace as LPVStateSpace
 from lpvid.models import MechanicalStructure as MechanicalStructure
 from lpvid.models import ModalStructure as ModalStructure
 from lpvid.models import NaiveAverage as NaiveAverage
+from lpvid.models import NonlinearModel as NonlinearModel
 from lpvid.models import Polynomial as Polynomial
 from lpvid.models import ResponseAverage as ResponseAverage
 from lpvid.models import Spline as Spline
@@ -116,6 +119,9 @@ from lpvid.models import to_scipy as to_scipy
 from lpvid.reduce import Reduction as Reduction
 from lpvid.reduce import balanced_truncation as balanced_truncation
 from lpvid.reduce import hankel_singular_values as hankel_singular_values
+from lpvid.reduce import modal_table as modal_table
+from lpvid.reduce import modal_truncation as modal_truncation
+from lpvid.reduce import update_model as update_model
 from lpvid.refinement import HuberLoss as HuberLoss
 from lpvid.refinement import Innovation as Innovation
 from lpvid.refinement import OutputError as OutputError

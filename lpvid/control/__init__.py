@@ -31,6 +31,7 @@ from lpvid.control._schedule_check import check_schedule as check_schedule
 from lpvid.control._schedule_check import check_trajectory as check_trajectory
 from lpvid.control._scheduled import ScheduledController as ScheduledController
 from lpvid.control._scheduled import ScheduleDesign as ScheduleDesign
+from lpvid.control._scheduled import gains_of as gains_of
 from lpvid.control._scheduled import schedule_design as schedule_design
 from lpvid.control._search import ControllerDesign as ControllerDesign
 from lpvid.control._two_link_loop import simulate_two_link_loop as simulate_two_link_loop

@@ -190,7 +190,8 @@ def schedule_design(
     Example:
         >>> from lpvid.control import PDP, schedule_design
         >>> def plant(kappa):
-        ...     return StateSpace(0.9 * kappa[:, None], [[1.0]], [[1.0], [0.0], [0.0], [0.0]], dt=0.1)
+        ...     C = jnp.eye(4, 1)
+        ...     return StateSpace(0.9 * kappa[:, None], [[1.0]], C, dt=0.1)
         >>> found = schedule_design(plant, lambda m: PDP(m.A[0, 0], 0.0, 0.0), [0.5, 1.0])
         >>> found.controller.at(0.75).proportional.round(3), bool(found.check.stable.all())
         (Array(0.675, dtype=float64), True)
@@ -221,7 +222,16 @@ def schedule_design(
 
 
 def gains_of(controller: SampledController) -> Float[Array, " gain"]:
-    """All arrays of real numbers that a controller holds, as one."""
+    """All arrays of real numbers that a controller holds, as one, in the order of its fields.
+
+    Args:
+        controller: any.
+
+    Example:
+        >>> from lpvid.control import PDP, gains_of
+        >>> gains_of(PDP(0.5, 3.0, 0.1)).tolist()
+        [0.5, 3.0, 0.1]
+    """
     return ravel_pytree(eqx.filter(controller, eqx.is_inexact_array))[0]
 
 

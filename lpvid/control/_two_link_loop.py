@@ -83,8 +83,9 @@ def simulate_two_link_loop(
             arm, 1 ms accurate.
 
     Returns:
-        `ClosedLoopMotion` with u (time, 2), y (time, 5), κ last, and states [θ, v, θ̇, v̇] (time, 8); status
-        `nonfinite` where the integrator diverged or the end effector left the rigid arm's reach.
+        `ClosedLoopMotion` with u (time, 2), y (time, 5), κ last, and states [θ, v, θ̇, v̇] (time, 8);
+        status `nonfinite` where the integrator diverged or the end effector left the rigid arm's
+        reach.
 
     Raises:
         ValueError: a reference that is not (time, nr), a sample time or number of substeps that is

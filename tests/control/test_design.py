@@ -150,7 +150,7 @@ def test_itae_and_its_gradient_through_the_loop():
 
 @pytest.mark.slow
 def test_pi_design_finds_the_least_cost():
-    """A motor: the grid's best lies no lower, two starts agree, and the bounds hold."""
+    """A motor: the grid's best lies no lower than the best start's end, and the bounds hold."""
     motor = StateSpace([[0.0, 1.0], [0.0, -4.0]], [[0.0], [4.0]], [[1.0, 0.0]]).discretise(DT)
     bounds = ((0.1, 1e-4), (3.0, 0.2))
     found = design_pi(motor, starts=((0.3, 0.1), (2.5, 0.01)), bounds=bounds, duration=6.0)

@@ -1,0 +1,1 @@
+"""The flexible-manipulator thesis (002) end to end: identify, reduce, validate, control."""
