@@ -183,27 +183,31 @@ def single_link_designs() -> tuple[SampledController, ScheduleDesign]:
     """The best fixed PDP controller, and designs at the three payloads."""
     models = [single_link(jnp.array([payload])).discretise(ARM_DT) for payload in PAYLOADS]
     fixed = design_pdp(models).controller
-    floors = {"gain_margin": 12.0, "phase_margin": 60.0}
-    scheduled = schedule_design(
-        single_link, lambda model: design_pdp([model], **floors), PAYLOADS, dt=ARM_DT
-    )
+
+    def design(model: StateSpace):
+        return design_pdp([model], gain_margin=12.0, phase_margin=60.0)
+
+    scheduled = schedule_design(single_link, design, PAYLOADS, dt=ARM_DT)
     return fixed, scheduled
 
 
 def single_link_row(name: str, controller: SampledController) -> list[str]:
     """One row of the table: ITAE on the nonlinear arm, margins at the error over payloads."""
-    scheduled = isinstance(controller, ScheduledController)
+
+    def frozen(payload) -> SampledController:
+        if isinstance(controller, ScheduledController):
+            return controller.at(payload)
+        return controller
 
     def measures(payload, set_point):
-        control = controller.at(payload) if scheduled else controller
+        control = frozen(payload)
         arm = reference_single_link_arm(payload_mass=payload)
         asked = jnp.full(round(10.0 / ARM_DT), set_point)
         motion = simulate_closed_loop(arm, control, reference=asked, dt=ARM_DT, saturation=10.0)
         return itae(set_point - motion.y[:, 0], ARM_DT) / set_point
 
     def reserves(payload):
-        control = controller.at(payload) if scheduled else controller
-        loop = loop_transfer(single_link(payload[None]), control, dt=ARM_DT)
+        loop = loop_transfer(single_link(payload[None]), frozen(payload), dt=ARM_DT)
         found = margins(loop)
         return found.gain_margin_decibels, jnp.abs(found.phase_margin)
 

@@ -1,7 +1,7 @@
 """Stability and margins of scheduled loops: frozen, along trajectories, and for bounded rates."""
 
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -234,7 +234,7 @@ def frozen_models(model: Scheduled, points: np.ndarray, dt: float | None) -> Sta
                 f"kappas: {outside.tolist()} lie outside of the hull that the model was built "
                 "from; give points inside, or a model of more operating points."
             )
-    freeze = getattr(model, "at", model)
+    freeze: Any = getattr(model, "at", model)
     plants = jax.vmap(freeze)(jnp.asarray(points))
     check_no_feedthrough(plants)
     step = sample_time(plants, dt)
@@ -254,12 +254,7 @@ def _grid(kappas: ArrayLike | Sequence) -> np.ndarray:
 
 def _frozen_controls(controller: SampledController, points: np.ndarray) -> SampledController:
     """The controller at all points: its arrays have the points as first axis."""
-    freeze = getattr(controller, "at", None)
-    if freeze is None:
-
-        def freeze(kappa):
-            return controller
-
+    freeze: Any = getattr(controller, "at", lambda kappa: controller)
     return eqx.filter_vmap(freeze)(jnp.asarray(points))
 
 

@@ -192,7 +192,9 @@ def schedule_design(
         >>> def plant(kappa):
         ...     C = jnp.eye(4, 1)
         ...     return StateSpace(0.9 * kappa[:, None], [[1.0]], C, dt=0.1)
-        >>> found = schedule_design(plant, lambda m: PDP(m.A[0, 0], 0.0, 0.0), [0.5, 1.0])
+        >>> def design(model):
+        ...     return PDP(model.A[0, 0], 0.0, 0.0)
+        >>> found = schedule_design(plant, design, [0.5, 1.0], between=1)
         >>> found.controller.at(0.75).proportional.round(3), bool(found.check.stable.all())
         (Array(0.675, dtype=float64), True)
     """

@@ -28,6 +28,7 @@ from lpvid.plot._poles import mode_frequencies as mode_frequencies
 from lpvid.plot._poles import poles as poles
 from lpvid.plot._residual_tests import residual_tests as residual_tests
 from lpvid.plot._residuals import residuals as residuals
+from lpvid.plot._scheduling import closed_loop_motions as closed_loop_motions
 from lpvid.plot._scheduling import schedule_margins as schedule_margins
 from lpvid.plot._scheduling import scheduled_gains as scheduled_gains
 from lpvid.plot._search import fit_over_points as fit_over_points

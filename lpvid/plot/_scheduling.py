@@ -1,4 +1,4 @@
-"""Scheduled control: gains over κ, what fixed and scheduled loops keep in hand."""
+"""Scheduled control: gains over κ, what fixed and scheduled loops keep in hand, and motions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from lpvid.control import ScheduleCheck, ScheduleDesign
+from lpvid.control import ClosedLoopMotion, ScheduleCheck, ScheduleDesign
 from lpvid.control import gains_of as gains_of_controller
 from lpvid.plot._figure import (
+    FAINT,
     channel_names,
     colour,
     dashes,
@@ -54,7 +55,9 @@ def scheduled_gains(
         >>> from lpvid.plot import scheduled_gains
         >>> def plant(kappa):
         ...     return StateSpace(0.9 * kappa[:, None], [[1.0]], [[1.0], [0], [0], [0]], dt=0.1)
-        >>> found = schedule_design(plant, lambda m: PDP(m.A[0, 0], 0.0, 0.0), [0.5, 1.0])
+        >>> def design(model):
+        ...     return PDP(model.A[0, 0], 0.0, 0.0)
+        >>> found = schedule_design(plant, design, [0.5, 1.0], between=1)
         >>> scheduled_gains(found, names=["K_P", "K_d", "K_sg"]).shape
         (1,)
     """
@@ -135,4 +138,70 @@ def schedule_margins(
     if len(found) > 1:
         legend_above(panels[0])
     panels[-1].set_xlabel(scheduling)
+    return panels
+
+
+@styled
+def closed_loop_motions(
+    motions: Any,
+    *,
+    labels: Sequence[str] | str | None = None,
+    outputs: Sequence[int] = (0,),
+    names: Sequence[str] | None = None,
+    axes: Any = None,
+) -> np.ndarray:
+    """Outputs with their set-points, and the commands, of one or several closed loops.
+
+    Args:
+        motions: one `lpvid.control.ClosedLoopMotion`, several, or a mapping from label to motion.
+        labels: of several ones.
+        outputs: which outputs; output i follows set-point i.
+        names: of those outputs and then of all commands.
+        axes: where to draw, one for each output and command; new ones by default.
+
+    Returns:
+        The axes, shape (outputs + commands,).
+
+    Raises:
+        ValueError: a motion with batch axes, an output without a set-point, names that do not fit.
+
+    Example:
+        >>> import numpy as np
+        >>> from lpvid.control import ProportionalIntegral, simulate_closed_loop
+        >>> from lpvid.models import StateSpace
+        >>> from lpvid.plot import closed_loop_motions
+        >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], dt=0.1)
+        >>> pi = ProportionalIntegral(0.2, 1.0, dt=0.1)
+        >>> closed_loop_motions(simulate_closed_loop(lag, pi, reference=np.ones(20))).shape
+        (2,)
+    """
+    found: dict[str, ClosedLoopMotion] = labelled(motions, labels, "motions", "loop")
+    first = next(iter(found.values()))
+    outputs = tuple(int(i) for i in outputs)
+    if any(one.y.ndim != 2 for one in found.values()):
+        raise ValueError("motions: draw one motion at a time, without batch axes.")
+    channels = min(min(one.reference.shape[1], one.y.shape[1]) for one in found.values())
+    if not all(0 <= i < channels for i in outputs):
+        raise ValueError(f"outputs={outputs}: give outputs that have a set-point, from 0 on.")
+    nu = first.u.shape[1]
+    count = len(outputs) + nu
+    if names is None:
+        names = [f"y{i + 1}" for i in outputs] + [f"u{i + 1}" for i in range(nu)]
+    names = channel_names(names, count, "", "names")
+    panels = grid_of_axes(count, 1, axes, size=(7.0, 0.8 + 1.7 * count), sharex=True)[:, 0]
+    for panel, i in zip(panels, outputs, strict=False):
+        look = {"color": FAINT, "linewidth": 1.6, "label": "set-point", "drawstyle": "steps-post"}
+        panel.plot(np.asarray(first.time), np.asarray(first.reference)[:, i], **look)
+    for k, (label, motion) in enumerate(found.items()):
+        look = {"color": colour(k), "linestyle": dashes(k), "label": label, "linewidth": 1.3}
+        time, y, u = (np.asarray(part) for part in (motion.time, motion.y, motion.u))
+        for panel, i in zip(panels, outputs, strict=False):
+            panel.plot(time, y[:, i], **look)
+        for panel, command in zip(panels[len(outputs) :], u.T, strict=True):
+            panel.plot(time, command, drawstyle="steps-post", **look)
+    for panel, name in zip(panels, names, strict=True):
+        dress(panel)
+        panel.set_ylabel(name)
+    legend_above(panels[0])
+    panels[-1].set_xlabel("time (s)")
     return panels
