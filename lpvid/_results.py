@@ -66,6 +66,11 @@ class Status(eqx.Enumeration):
         "definite one is returned. Check signs, the pairing of inputs with outputs, and the length "
         "of the records."
     )
+    unstable_predictor = (
+        "K makes the predictor unstable: its predictions never forget the first state, the cost "
+        "looks lower than it is, and intervals mean nothing. Start from a gain that makes it "
+        "stable, take longer records, or refine with OutputError()."
+    )
     infeasible = (
         "The margins asked for were not reached within the bounds; the design nearest to them is "
         "returned. Widen the bounds, give other starts, or ask for less."

@@ -3,9 +3,9 @@
     python -m benchmarks.manipulator [reduction] [control] [friction] [scheduling] [--out FOLDER]
 
 `reduction` is chapters 3 and 4.1: orders, updating, validation, PI on models of three types;
-`control` is sections 4.2 to 4.4: PDP, PDPC and ILQR. Beyond it, `friction` traces the arm's friction
-in a record and follows set-points with it; `scheduling` lets gains follow the posture. All by
-default.
+`control` is sections 4.2 to 4.4: PDP, PDPC and ILQR. Beyond it, `friction` traces the arm's
+friction in a record and follows set-points with it; `scheduling` lets gains follow the posture and
+the payload. All by default.
 """
 
 import os

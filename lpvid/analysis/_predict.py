@@ -160,9 +160,10 @@ def horizon_errors(
         if horizons is None:
             steps = [k for k in _DEFAULT_HORIZONS if k <= max(1, min(along.records) // 4)]
         else:
+            wrong = [k for k in horizons if k < 1 or k % 1 != 0]
+            if wrong:
+                raise ValueError(f"horizons: {wrong[0]} is given; whole numbers of at least 1 sample are needed.")
             steps = sorted({int(k) for k in horizons})
-        if steps and steps[0] < 1:
-            raise ValueError(f"horizons: {steps[0]} is given; at least 1 sample ahead is needed.")
     if steps:
         ahead = predict_ahead(along, inputs, y, gain, x0, tuple(steps))
         predictions = jnp.concatenate([ahead, predictions])

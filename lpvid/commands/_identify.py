@@ -50,7 +50,9 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
     refined = None
     if arguments.refine:
         predictor = Innovation() if arguments.predictor == "innovation" else OutputError()
-        refined = refine(fit, train, predictor=predictor)
+        # Means are not offsets, and a continuous-time method leaves what is left of them alone.
+        free = None if offset is None else "free"
+        refined = refine(fit, train, predictor=predictor, output_offset=free)
         fits["refined"] = refined
     scores = {name: _scores(found, train, test) for name, found in fits.items()}
     final = fits["refined" if arguments.refine else "identified"]

@@ -96,7 +96,7 @@ def integrate(
 ) -> Float[Array, "outputs state"]:
     """Integrate ẋ = f(x, u) by the classical Runge–Kutta rule, u held over each sample.
 
-    The rule is of fourth order and stable while |λ| dt / substeps < 2.78 for the fastest pole λ; a
+    The rule is of fourth order and stable while |λ| dt / substeps < 2.61 for the fastest pole λ; a
     non-finite state means that `substeps` is too low. Differentiable in everything that is not
     static; reverse mode keeps one state per returned sample and recomputes the rest. Compiled as
     two nested `lax.scan` loops whatever the length; wrap repeated calls in `jit`.

@@ -26,7 +26,7 @@ class NonlinearModel(eqx.Module):
         dynamics: (plant, x, u) → ẋ, smooth in all three.
         output: (plant, x, u) → y at the same sample, (ny,).
         rest: the plant's state where the model's is zero. A search begins here: h must be smooth.
-        substeps: Runge–Kutta steps a sample; |λ| dt / substeps < 2.78 for the fastest pole λ.
+        substeps: Runge–Kutta steps a sample; |λ| dt / substeps < 2.61 for the fastest pole λ.
 
     Raises:
         ValueError: `rest` holds no finite numbers, or `substeps` is below one.
@@ -62,7 +62,7 @@ class NonlinearModel(eqx.Module):
     ):
         # Plain numbers become arrays: they are parameters too.
         self.plant = jax.tree.map(
-            lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, plant
+            lambda leaf: jnp.asarray(leaf, float) if _is_number(leaf) else leaf, plant
         )
         self.dynamics = dynamics
         self.output = output
@@ -146,3 +146,7 @@ class NonlinearModel(eqx.Module):
 @eqx.filter_jit
 def _simulate(model: NonlinearModel, u: Array, dt: Array, x0: Array) -> Float[Array, "time ny"]:
     return jax.lax.scan(lambda x, now: model.step(x, now, dt=dt), x0, u)[1]
+
+
+def _is_number(leaf: Any) -> bool:
+    return isinstance(leaf, int | float) and not isinstance(leaf, bool)

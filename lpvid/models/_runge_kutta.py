@@ -15,7 +15,7 @@ def runge_kutta_step(
 ) -> Float[Array, " state"]:
     """One step of the classical Runge–Kutta method for ẋ = f(x, u), u held.
 
-    Of fourth order, and stable while |λ| step < 2.78 for the fastest pole λ.
+    Of fourth order, and stable while |λ| step < 2.61 for the fastest pole λ.
 
     Args:
         dynamics: f(x, u).

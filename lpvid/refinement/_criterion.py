@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lpvid.refinement._levenberg_marquardt import NormalEquations, Unknowns
 from lpvid.refinement._losses import AbstractLoss, Mask, Residual
@@ -13,6 +13,8 @@ from lpvid.refinement._parameterisation import AbstractParameterisation, Record
 
 # Eigenvalues of states' sensitivities below this share of the largest are rounding.
 _RANK = 1e-12
+# Share of a sensitivity, in squares, that states must leave of it to count.
+_TOLD = 1e-20
 
 
 class Problem(eqx.Module):
@@ -51,8 +53,9 @@ class Problem(eqx.Module):
 
     def residual(self, unknowns: Unknowns) -> Residual:
         """y − ŷ of every record, zero where nothing was measured."""
-        prepared = self.parameterisation.prepare(self.values(unknowns.shared))
+        return self._residual(self.parameterisation.prepare(self.values(unknowns.shared)), unknowns)
 
+    def _residual(self, prepared: Any, unknowns: Unknowns) -> Residual:
         def one(each):
             record, mask, own, x0 = each
             y = self.parameterisation.respond(prepared, record, self._start(own, x0))
@@ -61,9 +64,27 @@ class Problem(eqx.Module):
         return over_records(one, (self.records, self.mask, unknowns.own, self.x0))
 
     def cost(self, unknowns: Unknowns) -> tuple[Float[Array, ""], Residual]:
-        """The loss, and the residual."""
-        residual = self.residual(unknowns)
-        return self.loss.cost(residual, self.mask, self.scale, self.floor), residual
+        """The loss, infinite for a predictor that does not forget its start, and the residual."""
+        prepared = self.parameterisation.prepare(self.values(unknowns.shared))
+        residual = self._residual(prepared, unknowns)
+        loss = self.loss.cost(residual, self.mask, self.scale, self.floor)
+        return jnp.where(self.parameterisation.forgets(prepared), loss, jnp.inf), residual
+
+    def forgetful(self, at: Unknowns) -> Bool[Array, ""]:
+        """Whether each record's last tenth depends no more on its first state than its first."""
+        prepared, tangents = self.tangents(at)
+
+        def one(each):
+            record, mask, own, x0 = each
+            by_own = self.sensitivity(prepared, tangents, record, mask, own, x0)[1]
+            power, place = jnp.sum(by_own**2, axis=(0, 2)), jnp.arange(mask.shape[0])
+            count = jnp.sum(mask)
+            tenth = jnp.maximum(count // 10, 1)
+            first = jnp.sum(jnp.where(place < tenth, power, 0.0))
+            last = jnp.sum(jnp.where((place >= count - tenth) & mask, power, 0.0))
+            return last <= first
+
+        return jnp.all(over_records(one, (self.records, self.mask, at.own, self.x0)))
 
     def tangents(self, unknowns: Unknowns) -> tuple[Any, Any]:
         """What the records share, and its derivatives along every coordinate."""
@@ -139,6 +160,9 @@ class Problem(eqx.Module):
             rows = _orthonormal((by_own @ factor.T).reshape(own.shape[0], -1))
             flat = by_shared.reshape(kept.shape[0], -1)
             left = flat - (flat @ rows.T) @ rows
+            # What the first state explains but for rounding is nothing that the record tells.
+            size, rest = (jnp.sum(part**2, axis=1, keepdims=True) for part in (flat, left))
+            left = jnp.where(rest > _TOLD * size, left, 0.0)
             return left.reshape(by_shared.shape), rows.reshape(by_own.shape)
 
         return over_records(one, (self.records, self.mask, at.own, self.x0))

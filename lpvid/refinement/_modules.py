@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lpvid.models import (
     GrayBoxLPV,
@@ -164,6 +164,11 @@ class ModuleParameterisation(AbstractParameterisation):
         if self.schedules == "moving":
             return moving()
         return jax.lax.cond(jnp.all(kappa == kappa[:1]), still, moving)
+
+    def forgets(self, prepared: Any) -> Bool[Array, ""]:
+        """Not told: that would take a second simulation."""
+        del prepared
+        return jnp.asarray(True)
 
     @property
     def overlap(self) -> int:

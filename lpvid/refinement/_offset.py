@@ -3,7 +3,9 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from lpvid.identify import Fit
 from lpvid.refinement._parameterisation import AbstractParameterisation, Record, Values
@@ -59,6 +61,10 @@ class WithOffset(AbstractParameterisation):
         own, offset = self._parts(values)
         return self.model.prepare(own), offset - self.reference
 
+    def forgets(self, prepared: Any) -> Bool[Array, ""]:
+        """As the model says."""
+        return self.model.forgets(prepared[0])
+
     def respond(self, prepared: Any, record: Record, x0: Array) -> Float[Array, "time ny"]:
         """The model's output for a record without the constant, and the constant."""
         model, rest = prepared
@@ -98,7 +104,7 @@ def _without(record: Record, rest: Float[Array, " ny"]) -> Record:
 
 
 def starting_offset(
-    model: Any, given: str | ArrayLike | None, ny: int
+    model: Any, given: str | ArrayLike | None, y: Float[Array, "time ny"]
 ) -> tuple[Float[Array, " ny"] | None, bool]:
     """The outputs' constants to begin with, and whether they are estimated.
 
@@ -114,10 +120,11 @@ def starting_offset(
                 f"output_offset={given!r}: give 'free', constants (ny,), or None for what the fit "
                 "that is refined did."
             )
-        return jnp.zeros(ny) if found is None else found, True
+        # From the mean: a slow model would take what is left of a large constant for its own.
+        return (found if _was_estimated(model) else jnp.mean(y, axis=0)), True
     known = jnp.asarray(given, float)
-    if known.shape != (ny,):
-        raise ValueError(f"output_offset: shape {known.shape} given; ({ny},) is needed.")
+    if known.shape != y.shape[1:]:
+        raise ValueError(f"output_offset: shape {known.shape} given; {y.shape[1:]} is needed.")
     return known, False
 
 
@@ -131,4 +138,8 @@ def _was_estimated(model: Any) -> bool:
     """Said by the fit, so that it is known under jit too."""
     if isinstance(model, Fit):
         return model.moments is not None and model.moments.offset
-    return isinstance(model, Refined) and isinstance(model.task.parameterisation, WithOffset)
+    if not isinstance(model, Refined) or not isinstance(model.task.parameterisation, WithOffset):
+        return False
+    # One that was held is held again.
+    chosen = model.task.selection.matrix[-model.task.parameterisation.reference.shape[0] :]
+    return isinstance(chosen, Tracer) or bool(np.any(np.asarray(chosen) > 0.0))

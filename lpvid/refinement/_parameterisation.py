@@ -6,10 +6,13 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from lpvid.data import IOData
 from lpvid.models import AbstractStructure, StateSpace, StructuredModel, one_step_predictor
+
+# Over 1024 samples: an integrator, or two, may stay in a predictor without a gain.
+_GROWTH = 4.0
 
 Values = Float[Array, " value"]
 
@@ -56,6 +59,14 @@ class AbstractParameterisation(eqx.Module):
     @abc.abstractmethod
     def respond(self, prepared: Any, record: Record, x0: Array) -> Float[Array, "time ny"]:
         """Predicted output of one record."""
+
+    @abc.abstractmethod
+    def forgets(self, prepared: Any) -> Bool[Array, ""]:
+        """Whether predictions do not hold on to the first state: no search leaves such models.
+
+        With the first state free, a predictor pole outside the unit circle makes the likelihood
+        look better than it is. True where it cannot be told cheaply.
+        """
 
     @property
     @abc.abstractmethod
@@ -159,6 +170,16 @@ class LinearParameterisation(AbstractParameterisation):
         u = jnp.concatenate([record.u, record.y], axis=1) if self.gain else record.u
         predictor = StateSpace(prepared.A, prepared.B, prepared.C, prepared.D, dt=1.0)
         return predictor.simulate(u=u, x0=x0)
+
+    def forgets(self, prepared: StateSpace) -> Bool[Array, ""]:
+        """Whether (A − K C)^2048 has not grown beyond (A − K C)^1024: poles within 1.001."""
+        if not self.gain:
+            return jnp.asarray(True)
+        power = prepared.A
+        for _ in range(10):
+            power = power @ power
+        sooner, later = (jnp.linalg.norm(each) for each in (power, power @ power))
+        return jnp.isfinite(later) & (later <= _GROWTH * sooner)
 
     @property
     def overlap(self) -> int:

@@ -60,6 +60,11 @@ class Innovation(AbstractPredictor):
     poor for one, refine with `OutputError(shooting=...)` first. Pieces with states of their own
     would leave K undetermined until they meet.
 
+    With the first state free, a predictor pole outside the unit circle makes the likelihood look
+    better than it is. The search of a linear model of constant matrices stays within the circle
+    (to 0.1 %); wherever a fit ends at predictions that do not forget their start, and on short
+    records of nearly pure output noise it may, the status is `unstable_predictor`.
+
     A module of one's own needs `n_states` (or `nx`) and `step(x, u, *, dt)` → (state one sample
     later, output at this one), `kappa` as one more keyword where it depends on a schedule, written
     with `jax.numpy` and smooth in the state and in the module's arrays. A plant with ẋ = f(x, u)

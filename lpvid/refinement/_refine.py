@@ -60,12 +60,11 @@ def refine(
     Args:
         model: what `identify`, `identify_mechanical`, `identify_step_response` or `refine`
             returned, a `StateSpace` (discrete at the data's sample time, or continuous: zero-order
-            hold), `StructuredModel`,
-            `LPVStateSpace` (its coefficients, along the data's `kappa`), `GrayBoxLPV` (its
-            parameters), `NonlinearModel`, or any `eqx.Module` with `simulate(u=, dt=, x0=)` or
-            `step(x, u, dt=)` (which `Innovation` needs), and `kappa=` where it takes one, whose
-            inexact arrays are the parameters and whose `n_states` (or `nx`) says how long x0 is;
-            without it, x0 is not passed.
+            hold), `StructuredModel`, `LPVStateSpace` (its coefficients, along the data's `kappa`),
+            `GrayBoxLPV` (its parameters), `NonlinearModel`, or any `eqx.Module` with
+            `simulate(u=, dt=, x0=)` or `step(x, u, dt=)` (which `Innovation` needs), and `kappa=`
+            where it takes one, whose inexact arrays are the parameters and whose `n_states` (or
+            `nx`) says how long x0 is; without it, x0 is not passed.
         data: one or several records.
         predictor: `OutputError()` by default, or `Innovation()`.
         loss: `SquaredLoss()` by default, or `HuberLoss()`.
@@ -77,8 +76,9 @@ def refine(
         initial_state: `"free"` (estimated, one a record), `"zero"`, or known states (nx,) or
             (record, nx).
         output_offset: `"free"` (a constant in each output, common to all records, is estimated as
-            `offset[k]`) or known constants (ny,); by default, what the fit that is refined did, so
-            that an estimated offset stays an unknown and the intervals of the gain account for it.
+            `offset[k]`, from the mean on) or known constants (ny,); by default, what the fit that
+            is refined did, so that an estimated offset stays an unknown and the intervals of the
+            gain account for it.
         max_steps: limit on the trial steps.
         throw: raise where no fit came out. `False` returns it with its status, and warns.
 
@@ -112,7 +112,7 @@ def refine(
         raise ValueError(f"loss={loss!r}: give SquaredLoss() or HuberLoss().")
     if max_steps < 1:
         raise ValueError(f"max_steps: at least 1 is needed, got {max_steps}.")
-    offset, estimated = starting_offset(model, output_offset, data.ny)
+    offset, estimated = starting_offset(model, output_offset, data.y)
     if offset is not None:
         data = data.replace(y=data.y - offset[None])
     start = recognise(model, data, predictor)
@@ -157,6 +157,12 @@ def prepare(
             raise ValueError(
                 f"bounds[{pattern!r}]: names a parameter that is fixed; leave one of the two out."
             )
+    twice = sorted({name for name in kind.names if kind.names.count(name) > 1})
+    if twice:
+        raise ValueError(
+            f"model: {', '.join(twice)} would name two values each, one of them the gain's or the "
+            "offset's; rename the model's own."
+        )
     chosen, inner_lower, inner_upper = _chosen(selection, start.values, lower, upper)
     free, x0 = _initial_state(initial_state, kind, black_box, len(data.lengths))
     shooting = predictor.shooting if isinstance(predictor, OutputError) else None

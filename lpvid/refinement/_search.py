@@ -287,6 +287,8 @@ def assess(
     status = Status.where(jnp.any(known.unidentified), Status.unidentified, status)
     status = Status.where(solution.status == Status.successful, status, solution.status)
     status = Status.where(found.gap <= _CLOSED, status, Status.discontinuous)
+    if task.free_start and task.parameterisation.innovation_gain(problem.base) is not None:
+        status = Status.where(problem.forgetful(at), status, Status.unstable_predictor)
     # Worse than no model at all: the search never came down from a simulation that grows.
     grown = ~(jnp.diagonal(noise) <= _GROWN * jnp.diagonal(power) + problem.floor)
     status = Status.where(jnp.any(grown), Status.overflow, status)

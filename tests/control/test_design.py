@@ -10,6 +10,7 @@ from lpvid._results import Status, is_successful
 from lpvid.control import (
     PDP,
     ProportionalIntegral,
+    _design_pdp,
     closed_loop,
     design_ilqr,
     design_pdp,
@@ -195,19 +196,23 @@ def test_ilqr_follows_at_rest_and_places_its_poles():
 
 
 @pytest.mark.slow
-def test_pdp_design_meets_margins_that_bind_from_three_starts():
-    models = [arm(1.0), arm(2.0)]
-    asked = {"bounds": ((0.05, 0.05, 0.005), (3.0, 8.0, 1.0)), "duration": 5.0}
-    starts = ((0.3, 1.0, 0.1), (0.6, 4.0, 0.25), (0.8, 3.0, 0.5))
-    free = design_pdp(models, starts=starts, phase_margin=1.0, gain_margin=1.0, **asked)
-    least = min(float(margins(loop_transfer(m, free.controller)).phase_margin) for m in models)
-    bound = design_pdp(models, starts=starts, phase_margin=least + 4.0, gain_margin=1.0, **asked)
-    held = min(float(margins(loop_transfer(m, bound.controller)).phase_margin) for m in models)
+def test_pdp_design_meets_a_margin_that_binds(monkeypatch):
+    models = [arm(1.0)]
+    asked = {
+        "starts": ((0.8, 3.0, 0.5),),
+        "bounds": ((0.05, 0.05, 0.005), (3.0, 8.0, 1.0)),
+        "gain_margin": 1.0,
+        "duration": 2.5,
+        "max_steps": 10,
+    }
+    free = design_pdp(models, phase_margin=1.0, **asked)
+    least = float(margins(loop_transfer(models[0], free.controller)).phase_margin)
+    bound = design_pdp(models, phase_margin=least + 4.0, **asked)
+    held = float(margins(loop_transfer(models[0], bound.controller)).phase_margin)
     assert held >= (least + 4.0) * (1 - 1e-3)
     assert float(bound.cost) > float(free.cost)
-    np.testing.assert_allclose(free.costs, free.cost, rtol=1e-2)
-    np.testing.assert_allclose(bound.costs, bound.cost, rtol=1e-2)
-    impossible = design_pdp(models, starts=starts, phase_margin=179.0, max_steps=5, **asked)
+    monkeypatch.setattr(_design_pdp, "_ROUNDS", 1)
+    impossible = design_pdp(models, phase_margin=179.0, **asked)
     assert impossible.status == Status.infeasible and not is_successful(impossible.status)
 
 

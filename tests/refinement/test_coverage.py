@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lpvid._results import Status
 from lpvid.data import IOData
 from lpvid.identify import PastOutputMOESP, identify
 from lpvid.models import FunctionStructure, StateSpace, StructuredModel
-from lpvid.refinement import HuberLoss, SquaredLoss, refine
+from lpvid.refinement import HuberLoss, Innovation, SquaredLoss, refine
 
 # Shares of 400 runs: a 95 % interval covers 95 ± 3.3 % of them but for one time in a thousand.
 RUNS, MARGIN = 400, 0.033
@@ -70,3 +71,53 @@ def test_outputs_of_one_noise_do_not_make_an_interval_too_narrow(loss):
     np.testing.assert_allclose(white, 0.95, atol=MARGIN)
     # The long-run variance is itself an estimate, a little low on 300 samples.
     assert np.all(robust > 0.88)
+
+
+@pytest.mark.slow
+def test_an_offset_that_an_integrator_hides_is_not_identified():
+    def integrator(parameters):
+        return jnp.zeros((1, 1)), parameters[:1, None], jnp.ones((1, 1))
+
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((200, 1))
+    truth = StructuredModel(FunctionStructure(integrator, nominal=np.array([2.0])), [2.0])
+    y = truth.simulate(u=u, dt=0.1) + 5.0 + 0.01 * rng.standard_normal((200, 1))
+    data = IOData(u=u, y=y, dt=0.1)
+    with pytest.warns(UserWarning, match=r"Not identified: offset\[0\]"):
+        fit = refine(truth, data, output_offset="free", throw=False)
+    assert abs(fit.parameters[0] - 2.0) < 4.0 * fit.standard_errors[0] < 0.1
+    assert np.isinf(fit.standard_errors[1])
+    # From rest it can be told.
+    known = refine(truth, data, output_offset="free", initial_state="zero")
+    assert abs(known.output_offset[0] - 5.0) < 4.0 * known.standard_errors[1]
+
+
+@pytest.mark.slow
+def test_a_predictor_that_never_forgets_its_start_is_said():
+    truth = StructuredModel(
+        FunctionStructure(
+            lambda p: (
+                jnp.stack([jnp.array([0.0, 1.0]), -p]),
+                jnp.array([[0.0], [1.0]]),
+                jnp.eye(1, 2),
+            ),
+            nominal=np.array([9.0, 0.5]),
+        ),
+        [9.0, 0.5],
+    )
+
+    def run(key):
+        first, second = jax.random.split(key)
+        u = jax.random.normal(first, (240, 1))
+        y = truth.simulate(u=u, dt=0.1) + 0.05 * jax.random.normal(second, (240, 1))
+        data = IOData(u=u, y=y, dt=0.1)
+        fit = refine(truth, data, predictor=Innovation(), throw=False)
+        model = fit.model.state_space.discretise(0.1)
+        power = jnp.linalg.matrix_power(model.A - fit.innovation_gain @ model.C, 1024)
+        growth = jnp.linalg.norm(power @ power) / jnp.linalg.norm(power)
+        return growth, fit.status == Status.unstable_predictor
+
+    growth, said = jax.lax.map(run, jax.random.split(jax.random.key(1), 20))
+    # Over 1024 samples a pole of 1.0014 grows by 4: no search goes further, and it is said.
+    assert np.all(growth < 4.0 * (1.0 + 1e-6))
+    assert np.any(growth > 2.0) and np.all(said[growth > 2.0])
