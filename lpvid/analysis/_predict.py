@@ -162,7 +162,9 @@ def horizon_errors(
         else:
             wrong = [k for k in horizons if k < 1 or k % 1 != 0]
             if wrong:
-                raise ValueError(f"horizons: {wrong[0]} is given; whole numbers of at least 1 sample are needed.")
+                raise ValueError(
+                    f"horizons: {wrong[0]} is given; give whole numbers of at least 1 sample."
+                )
             steps = sorted({int(k) for k in horizons})
     if steps:
         ahead = predict_ahead(along, inputs, y, gain, x0, tuple(steps))

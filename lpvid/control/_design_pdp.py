@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from lpvid._results import Solution, Status
+from lpvid._results import Solution
 from lpvid._solve import Bounds
 from lpvid.control._closed_loop import Numbers, check_no_feedthrough, sample_time
 from lpvid.control._controllers import PDP
@@ -19,14 +18,12 @@ from lpvid.control._search import (
     GainBounds,
     Multipliers,
     bounds_of,
-    no_multipliers,
-    search_gains,
+    search_in_rounds,
+    search_round,
     settled,
 )
 from lpvid.models import StateSpace
 
-# By what share a margin may be missed and still count as met.
-_SLACK = 1e-4
 # Most searches after the first.
 _ROUNDS = 10
 
@@ -87,24 +84,13 @@ def design_pdp(
     weights = jnp.asarray([error_weight, strain_weight], float)
     wanted = jnp.asarray([gain_margin, phase_margin], float)
     problem = (limits, weights, wanted, samples, max_steps)
-    multipliers = no_multipliers(starts.shape[0], 2 * len(models))
-    found, costs, multipliers = _search(plants, starts, multipliers, *problem)
-    for _ in range(_ROUNDS):
-        before = costs
-        found, costs, multipliers = _search(plants, found.value, multipliers, *problem)
-        # A search that a kink ended may go on from there; margins that bind need several rounds.
-        if not jnp.any((jnp.abs(costs / before - 1.0) > 1e-5) | (multipliers.missed > _SLACK)):
-            break
-    excess = multipliers.missed
-    holds = excess <= _SLACK
-    chosen = jnp.argmin(jnp.where(jnp.any(holds), jnp.where(holds, costs, jnp.inf), excess))
-    best = jax.tree.map(lambda leaf: leaf[chosen], found)
-    return ControllerDesign(
-        controller=PDP(best.value[0], best.value[1], best.value[2]),
-        cost=costs[chosen],
-        status=Status.where(holds[chosen], best.status, Status.infeasible),
-        gains=found.value,
-        costs=jnp.where(holds, costs, jnp.inf),
+    return search_in_rounds(
+        lambda starts, multipliers: _search(plants, starts, multipliers, *problem),
+        starts,
+        2 * len(models),
+        rounds=_ROUNDS,
+        tolerance=1e-5,
+        controller=lambda gains: PDP(gains[0], gains[1], gains[2]),
         names=("K_P", "K_d", "K_sg"),
     )
 
@@ -193,14 +179,4 @@ def _search(
         # Beyond ten times the margin asked for nothing is gained; infinite ones stay finite.
         return 1.0 - (jnp.clip(reached / wanted[:, None], -10.0, 10.0)).ravel()
 
-    def one(start, multipliers):
-        # The logarithm tames the growth of a loop that is not stable.
-        found = search_gains(
-            lambda gains: jnp.log(cost(gains)) + multipliers.added(lacking(gains)),
-            start,
-            bounds,
-            max_steps,
-        )
-        return found, cost(found.value), multipliers.updated(lacking(found.value))
-
-    return jax.vmap(one)(starts, multipliers)
+    return search_round(cost, lacking, starts, multipliers, bounds, max_steps)

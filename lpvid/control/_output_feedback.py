@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from lpvid._results import Solution, Status
+from lpvid._results import Solution
 from lpvid._solve import Bounds
 from lpvid.control._closed_loop import check_no_feedthrough, sample_time
 from lpvid.control._criteria import itae
@@ -17,15 +17,13 @@ from lpvid.control._search import (
     ControllerDesign,
     Multipliers,
     bounds_of,
-    no_multipliers,
-    search_gains,
+    search_in_rounds,
+    search_round,
     settled,
 )
 from lpvid.mechanics import SampledController
 from lpvid.models import StateSpace
 
-# By what share a constraint may be missed and still count as met.
-_SLACK = 1e-4
 # Most searches after the first.
 _ROUNDS = 7
 # Of the smooth maximum, in units of what it is taken over.
@@ -140,25 +138,13 @@ def design_output_feedback(
         plants = jax.tree.map(lambda leaf: leaf[None], plants)
     wanted = jnp.asarray([disc_margin, slowest], float)
     problem = (limits, F, tracked, wanted, samples, max_steps)
-    multipliers = no_multipliers(len(starts), 2 * plants.batch_shape[0])
-    found, costs, multipliers = _search(plants, flat, multipliers, *problem)
-    for _ in range(_ROUNDS):
-        before = costs
-        found, costs, multipliers = _search(plants, found.value, multipliers, *problem)
-        # A search that a kink ended may go on from there; margins that bind need several rounds.
-        if not jnp.any((jnp.abs(costs / before - 1.0) > 1e-4) | (multipliers.missed > _SLACK)):
-            break
-    holds = multipliers.missed <= _SLACK
-    chosen = jnp.argmin(
-        jnp.where(jnp.any(holds), jnp.where(holds, costs, jnp.inf), multipliers.missed)
-    )
-    best = jax.tree.map(lambda leaf: leaf[chosen], found)
-    return ControllerDesign(
-        controller=OutputFeedback(best.value.reshape(shape), F),
-        cost=costs[chosen],
-        status=Status.where(holds[chosen], best.status, Status.infeasible),
-        gains=found.value,
-        costs=jnp.where(holds, costs, jnp.inf),
+    return search_in_rounds(
+        lambda starts, multipliers: _search(plants, starts, multipliers, *problem),
+        flat,
+        2 * plants.batch_shape[0],
+        rounds=_ROUNDS,
+        tolerance=1e-4,
+        controller=lambda gains: OutputFeedback(gains.reshape(shape), F),
         names=tuple(f"K{i + 1}{j + 1}" for i in range(shape[0]) for j in range(shape[1])),
     )
 
@@ -255,14 +241,4 @@ def _search(
         decay = -_smooth_maximum(jnp.log(jnp.abs(jnp.linalg.eigvals(spread.A))) / plants.dt)
         return 1.0 - jnp.concatenate([margin / wanted[0], jnp.clip(decay / wanted[1], -10.0, 10.0)])
 
-    def one(start, multipliers):
-        # The logarithm tames the growth of a loop that is not stable.
-        found = search_gains(
-            lambda gains: jnp.log(cost(gains)) + multipliers.added(lacking(gains)),
-            start,
-            bounds,
-            max_steps,
-        )
-        return found, cost(found.value), multipliers.updated(lacking(found.value))
-
-    return jax.vmap(one)(starts, multipliers)
+    return search_round(cost, lacking, starts, multipliers, bounds, max_steps)

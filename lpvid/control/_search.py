@@ -17,6 +17,8 @@ from lpvid.models import StateSpace
 
 # Of the gradient of a logarithmic cost in the bounds' free coordinates.
 _TOLERANCE = 1e-5
+# By what share a constraint may be missed and still count as met.
+_SLACK = 1e-4
 # At 3000 samples a growth of 1e64.
 _LARGEST_RADIUS = 1.05
 
@@ -150,4 +152,79 @@ def no_multipliers(starts: int, constraints: int) -> Multipliers:
     """
     return Multipliers(
         jnp.zeros((starts, constraints)), jnp.full(starts, 10.0), jnp.full(starts, jnp.inf)
+    )
+
+
+def search_round(
+    cost: Callable[[Gains], Array],
+    lacking: Callable[[Gains], Array],
+    starts: Float[Array, "start gain"],
+    multipliers: Multipliers,
+    bounds: Bounds,
+    max_steps: int,
+) -> tuple[Solution, Float[Array, " start"], Multipliers]:
+    """One round of an augmented Lagrangian, from every start at once.
+
+    Args:
+        cost: of gains, positive.
+        lacking: by what share gains miss each constraint.
+        starts: where to begin.
+        multipliers: of the round before.
+        bounds: of the gains.
+        max_steps: of each search.
+    """
+
+    def one(start, multipliers):
+        # The logarithm tames the growth of a loop that is not stable.
+        found = search_gains(
+            lambda gains: jnp.log(cost(gains)) + multipliers.added(lacking(gains)),
+            start,
+            bounds,
+            max_steps,
+        )
+        return found, cost(found.value), multipliers.updated(lacking(found.value))
+
+    return jax.vmap(one)(starts, multipliers)
+
+
+def search_in_rounds(
+    one_round: Callable[..., tuple[Solution, Array, Multipliers]],
+    starts: Float[Array, "start gain"],
+    constraints: int,
+    *,
+    rounds: int,
+    tolerance: float,
+    controller: Callable[[Gains], SampledController],
+    names: tuple[str, ...],
+) -> ControllerDesign:
+    """Rounds until costs stay and constraints hold, and the best design of those that hold them.
+
+    Args:
+        one_round: starts and multipliers to solutions, costs and multipliers.
+        starts: where to begin.
+        constraints: how many there are.
+        rounds: after the first one, at most.
+        tolerance: change of the costs, as a share, that counts as none.
+        controller: of gains.
+        names: of the gains.
+    """
+    found, costs, multipliers = one_round(starts, no_multipliers(len(starts), constraints))
+    for _ in range(rounds):
+        before = costs
+        found, costs, multipliers = one_round(found.value, multipliers)
+        # A search that a kink ended may go on from there; margins that bind need several rounds.
+        moved = jnp.abs(costs / before - 1.0) > tolerance
+        if not jnp.any(moved | (multipliers.missed > _SLACK)):
+            break
+    holds = multipliers.missed <= _SLACK
+    worst = jnp.where(jnp.any(holds), jnp.where(holds, costs, jnp.inf), multipliers.missed)
+    chosen = jnp.argmin(worst)
+    best = jax.tree.map(lambda leaf: leaf[chosen], found)
+    return ControllerDesign(
+        controller=controller(best.value),
+        cost=costs[chosen],
+        status=Status.where(holds[chosen], best.status, Status.infeasible),
+        gains=found.value,
+        costs=jnp.where(holds, costs, jnp.inf),
+        names=names,
     )
