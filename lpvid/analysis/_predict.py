@@ -11,11 +11,11 @@ from jaxtyping import Array, Float
 from lpvid.analysis._metrics import bft, nrmse_fit
 from lpvid.analysis._runs import (
     Numbers,
-    Run,
     as_channels,
     as_schedule,
     predict_ahead,
     record_lengths,
+    run_of,
     simulate_run,
 )
 
@@ -46,6 +46,7 @@ def predict(
     kappa: Numbers | None = None,
     dt: float | None = None,
     x0: Numbers | None = None,
+    output_offset: Numbers | None = None,
     horizon: int | None = 1,
     lengths: Sequence[int] | None = None,
 ) -> Float[Array, "time ny"]:
@@ -62,15 +63,20 @@ def predict(
     Works under `jit`, `vmap` and `grad` (forward and reverse).
 
     Args:
-        model: discrete-time `StateSpace`, `LPVStateSpace`, `GrayBoxLPV`, `NonlinearModel` or
-            another module with `step(x, u, dt=)`, such as the `model` of a `Refined`; for
-            simulation anything with `simulate(u=, x0=)`.
+        model: what `identify` or `refine` returned, whose model, gain and output offset are used;
+            or a `StateSpace`, `StructuredModel`, `LPVStateSpace`, `GrayBoxLPV`, `NonlinearModel` or
+            another module with `step(x, u, dt=)`; for simulation anything with `simulate(u=, x0=)`.
         u: input, (time, nu) or (time,), records one after another.
-        y: measured output, (time, ny) or (time,); not needed for simulation.
-        gain: innovation gain K, (nx, ny); without it the output is simulated, whatever the horizon.
+        y: measured output, (time, ny) or (time,); not needed for simulation, and a fit given none
+            is simulated.
+        gain: innovation gain K, (nx, ny), by default the fit's; without one the output is
+            simulated, whatever the horizon.
         kappa: schedule (time, nk), or (time,) for one scheduling variable, of an LPV model.
-        dt: sample time, s, of a model in continuous time that is no `StateSpace`.
-        x0: state at the start of each record, (record, nx) or (nx,); zero by default.
+        dt: sample time, s, of a model in continuous time.
+        x0: state at the start of each record, (record, nx) or (nx,); zero by default, since a
+            fit's `x0` is that of the records it was fitted to.
+        output_offset: constant to add to the model's outputs, (ny,) or (record, ny); by default
+            the fit's, which has to be of as many records where it is of each.
         horizon: k, at least 1; `None` for simulation (an infinite horizon).
         lengths: samples of each record; one record by default.
 
@@ -96,10 +102,10 @@ def predict(
     records = record_lengths(lengths, inputs.shape[0])
     if horizon is not None and (isinstance(horizon, bool) or horizon < 1 or horizon % 1 != 0):
         raise ValueError(f"horizon is {horizon!r}; give a whole number of at least 1, or None.")
-    along = Run(model, schedule, dt, records)
-    if gain is None or horizon is None:
+    along = run_of(model, schedule, dt, records, gain, output_offset)
+    if along.gain is None or horizon is None or (gain is None and y is None):
         return simulate_run(along, inputs, x0)
-    return predict_ahead(along, inputs, y, gain, x0, (int(horizon),))[0]
+    return predict_ahead(along, inputs, y, x0, (int(horizon),))[0]
 
 
 def horizon_errors(
@@ -111,6 +117,7 @@ def horizon_errors(
     kappa: Numbers | None = None,
     dt: float | None = None,
     x0: Numbers | None = None,
+    output_offset: Numbers | None = None,
     horizons: Sequence[int] | None = None,
     lengths: Sequence[int] | None = None,
 ) -> HorizonErrors:
@@ -127,6 +134,7 @@ def horizon_errors(
         kappa: as for `predict`.
         dt: as for `predict`.
         x0: as for `predict`.
+        output_offset: as for `predict`.
         horizons: samples ahead; 1, 2, 3, 5, … below a quarter of the shortest record by default.
         lengths: as for `predict`.
 
@@ -148,7 +156,8 @@ def horizon_errors(
         ([1.0, 5.0, inf], (3, 1))
     """
     inputs, measured = as_channels(u, "u"), as_channels(y, "y")
-    along = Run(model, as_schedule(kappa, u), dt, record_lengths(lengths, inputs.shape[0]))
+    records = record_lengths(lengths, inputs.shape[0])
+    along = run_of(model, as_schedule(kappa, u), dt, records, gain, output_offset)
     simulated = simulate_run(along, inputs, x0)
     if simulated.shape != measured.shape:
         raise ValueError(
@@ -156,7 +165,7 @@ def horizon_errors(
             "of the model over the time of u, time first."
         )
     predictions, steps = simulated[None], []
-    if gain is not None:
+    if along.gain is not None:
         if horizons is None:
             steps = [k for k in _DEFAULT_HORIZONS if k <= max(1, min(along.records) // 4)]
         else:
@@ -167,7 +176,7 @@ def horizon_errors(
                 )
             steps = sorted({int(k) for k in horizons})
     if steps:
-        ahead = predict_ahead(along, inputs, y, gain, x0, tuple(steps))
+        ahead = predict_ahead(along, inputs, y, x0, tuple(steps))
         predictions = jnp.concatenate([ahead, predictions])
     error = measured[None] - predictions
     # Each record about its own mean, so that records at different levels do not flatter the fit.

@@ -1,5 +1,6 @@
 """Simulation and prediction of a model along records."""
 
+import inspect
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
@@ -15,6 +16,7 @@ from lpvid.models import (
     GrayBoxLPV,
     LPVStateSpace,
     StateSpace,
+    StructuredModel,
     can_step,
     one_step_predictor,
     steps_of,
@@ -26,32 +28,80 @@ Numbers: TypeAlias = ArrayLike | Sequence[Any]
 
 
 class Run(NamedTuple):
-    """A model, and along what it runs."""
+    """A model, and along what it runs.
+
+    Attributes:
+        model: without what a fit knows beside it.
+        kappa: schedule, or None.
+        dt: sample time, or None where the model has its own.
+        records: their lengths.
+        gain: K, or None where the output is simulated.
+        offset: constants to add to the model's outputs, (ny,) or (record, ny), or None.
+    """
 
     model: Any
     kappa: Array | None
     dt: float | None
     records: tuple[int, ...]
+    gain: Any
+    offset: Array | None
 
     def cut(self, signal: Array) -> list[Array]:
         """A signal record by record."""
         return jnp.split(signal, np.cumsum(self.records)[:-1])
+
+    def level(self, ny: int) -> Float[Array, "time ny"]:
+        """The offset of every sample."""
+        if self.offset is None:
+            return jnp.zeros((sum(self.records), ny))
+        count = len(self.records)
+        if self.offset.shape not in ((ny,), (count, ny)):
+            raise ValueError(
+                f"output_offset has shape {self.offset.shape}; give ({ny},), or ({count}, {ny}) "
+                "for an offset of each record."
+            )
+        rows = jnp.broadcast_to(self.offset, (count, ny))
+        return rows[np.repeat(np.arange(count), self.records)]
 
     def schedules(self) -> Sequence[Array | None]:
         """κ record by record."""
         return [None] * len(self.records) if self.kappa is None else self.cut(self.kappa)
 
 
-def predict_ahead(
-    along: Run, u, y, gain, x0, horizons: tuple[int, ...]
-) -> Float[Array, "h time ny"]:
+def run_of(
+    item: Any,
+    kappa: Array | None,
+    dt: float | None,
+    records: tuple[int, ...],
+    gain: Any,
+    offset: Numbers | None,
+) -> Run:
+    """A model or a fit, and what is given in place of what the fit knows.
+
+    A fit is read by its attributes: rooms that fit come later than this one.
+    """
+    model, known = item, None
+    if not hasattr(item, "simulate") and not can_step(item):
+        model = getattr(item, "model", item)
+        gain = getattr(item, "innovation_gain", None) if gain is None else gain
+        known = getattr(item, "output_offset", None)
+    if isinstance(model, StructuredModel):
+        model = model.state_space
+    if isinstance(model, StateSpace) and not model.is_discrete and dt is not None:
+        model = model.discretise(dt)
+    offset = known if offset is None else offset
+    offset = None if offset is None else jnp.asarray(offset, float)
+    return Run(model, kappa, dt, records, gain, offset)
+
+
+def predict_ahead(along: Run, u, y, x0, horizons: tuple[int, ...]) -> Float[Array, "h time ny"]:
     """Predictions over every horizon."""
-    model = along.model
+    model, gain = along.model, along.gain
     linear = isinstance(model, StateSpace)
     if linear and (not model.is_discrete or model.A.ndim != 2):
         raise ValueError(
-            "model: with a gain one discrete-time StateSpace is needed; discretise it at the "
-            "data's sample time, use jax.vmap for a batch, or leave gain out to simulate."
+            "model: with a gain one discrete-time StateSpace is needed; give dt=, the data's "
+            "sample time, use jax.vmap for a batch, or leave gain out to simulate."
         )
     if not linear and not isinstance(model, LPVStateSpace | GrayBoxLPV) and not can_step(model):
         raise ValueError(
@@ -68,18 +118,25 @@ def predict_ahead(
         raise ValueError(f"y has shape {measured.shape}; ({u.shape[0]}, {ny}) is needed.")
     if K.shape != (nx, ny):
         raise ValueError(f"gain has shape {K.shape}; ({nx}, {ny}) is needed.")
+    level = along.level(ny)
+    measured = measured - level
     if linear:
         both = jnp.concatenate([u, measured], axis=1)
-        first = simulate_run(along._replace(model=one_step_predictor(model, K)), both, x0)
+        along = along._replace(model=one_step_predictor(model, K), offset=None)
+        first = simulate_run(along, both, x0)
         corrections = (measured - first) @ K.T
-        return first[None] - _forgotten(model, corrections, np.array(horizons), along.records)
+        beyond = _forgotten(model, corrections, np.array(horizons), along.records)
+        return (first + level)[None] - beyond
     starts = _starts(x0, len(along.records))
     starts = jnp.zeros((len(along.records), nx)) if starts is None else starts
     parts = zip(steps, along.cut(measured), starts, strict=True)
-    return jnp.concatenate([_stepped(one, y, K, start, horizons) for one, y, start in parts], 1)
+    found = [_stepped(one, y, K, start, horizons) for one, y, start in parts]
+    return jnp.concatenate(found, 1) + level[None]
 
 
 def _steps(along: Run, u: Array) -> list[AbstractSteps]:
+    if can_step(along.model):
+        _check_given(along.model.step, along.kappa, along.dt)
     parts = zip(along.cut(u), along.schedules(), strict=True)
     return [steps_of(along.model, u=u, kappa=kappa, dt=along.dt) for u, kappa in parts]
 
@@ -163,6 +220,12 @@ def _geometric_sums(A, w, position, counts, bits: int) -> Float[Array, "h time n
 
 
 def simulate_run(along: Run, u: Array, x0: Numbers | None) -> Float[Array, "time ny"]:
+    """Response and offset."""
+    y = _simulated(along, u, x0)
+    return y if along.offset is None else y + along.level(y.shape[-1])
+
+
+def _simulated(along: Run, u: Array, x0: Numbers | None) -> Float[Array, "time ny"]:
     """Response record by record, all at once where they have one length."""
     model, records = along.model, along.records
     starts = _starts(x0, len(records))
@@ -181,12 +244,27 @@ def _response(model, u, kappa, dt, x0) -> Float[Array, "time ny"]:
     if not hasattr(model, "simulate"):
         if not can_step(model):
             raise ValueError(f"model is a {type(model).__name__}, which has no simulate(u=, x0=).")
+        _check_given(model.step, kappa, dt)
         start = jnp.zeros(_states(model)) if x0 is None else x0
         return _stepped_alone(steps_of(model, u=u, kappa=kappa, dt=dt), start)
+    _check_given(model.simulate, kappa, dt)
     options: dict[str, Any] = {} if dt is None else {"dt": dt}
     if takes_schedule(model.simulate) and kappa is not None:
         options["kappa"] = kappa
     return model.simulate(u=u, x0=x0, **options)
+
+
+def _check_given(method: Any, kappa: Array | None, dt: float | None) -> None:
+    """Raise where a model's `simulate` or `step` cannot do without what is not given."""
+    parameters = inspect.signature(method).parameters
+    given = {
+        "kappa": (kappa, "depends on a schedule; give one value for each sample"),
+        "dt": (dt, "is in continuous time; give the sample time of u"),
+    }
+    for name, (value, reason) in given.items():
+        needed = name in parameters and parameters[name].default is inspect.Parameter.empty
+        if value is None and needed:
+            raise ValueError(f"{name}: the model {reason}.")
 
 
 @eqx.filter_jit

@@ -16,7 +16,13 @@ from lpvid.commands._cache import keep_compiled_code
 from lpvid.commands._errors import UsageError
 from lpvid.commands._messages import Warnings
 from lpvid.commands._output import NORMAL_95, check_targets
-from lpvid.commands._records import check_columns, offsets_of, read_records, without_offsets
+from lpvid.commands._records import (
+    check_columns,
+    offsets_of,
+    read_records,
+    with_rest,
+    without_offsets,
+)
 from lpvid.data import IOData
 from lpvid.identify import (
     ContinuousTimeMOESP,
@@ -55,7 +61,10 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
         f"Subspace step: filters of {float(start.tau):.4g} s, {int(start.block_rows)} rows; "
         "refined by output error."
     )
-    refined = refine(start, train)
+    # Means are not offsets: what they leave is estimated with the model.
+    refined = refine(start, train, output_offset=None if offset is None else "per record")
+    if offset is not None and refined.output_offset is not None:
+        offset = with_rest(offset, refined.output_offset)
     figures = _figures(refined)
     scores = {"start": _scores(start, train, test), "refined": _scores(refined, train, test)}
     _print(figures, scores, train)
@@ -92,18 +101,23 @@ def _scores(found: MechanicalFit | Refined, train: IOData, test: IOData) -> dict
 
 def _figures(refined: Refined) -> dict[str, Any]:
     """M, D, K and the modes, each with its standard deviation and 95 % interval."""
-    structure = refined.model.structure
+
+    def mechanical(parameters):
+        # Offsets are parameters of the fit, not of the model.
+        model = refined.model_at(parameters)
+        return model.structure.mechanical_matrices(model.parameters)
 
     def matrices(parameters):
-        return jnp.stack(structure.mechanical_matrices(parameters))
+        return jnp.stack(mechanical(parameters))
 
     def modes(parameters):
-        found = MassSpringDamper(*structure.mechanical_matrices(parameters)).modes()
+        found = MassSpringDamper(*mechanical(parameters)).modes()
         return jnp.stack([found.frequencies / (2.0 * jnp.pi), found.damping_ratios])
 
     # White measurement noise is rare: intervals for noise of any colour.
     covariance = refined.robust_covariance
-    figures: dict[str, Any] = {"unidentified": refined.stats["unidentified"]}
+    own = refined.model.structure.n_parameters
+    figures: dict[str, Any] = {"unidentified": refined.stats["unidentified"][:own]}
     for value, deviation, names in (
         (*_with_deviation(matrices, refined, covariance), NAMES),
         (*_with_deviation(modes, refined, covariance), ("frequency_hz", "damping_ratio")),
@@ -116,7 +130,7 @@ def _figures(refined: Refined) -> dict[str, Any]:
                     [centre - NORMAL_95 * spread, centre + NORMAL_95 * spread], -1
                 ),
             }
-    shapes = MassSpringDamper(*structure.mechanical_matrices(refined.parameters)).modes().shapes
+    shapes = MassSpringDamper(*mechanical(refined.parameters)).modes().shapes
     figures["mode_shapes"] = shapes / jnp.max(jnp.abs(shapes), axis=0)[None]
     return figures
 

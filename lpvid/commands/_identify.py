@@ -50,8 +50,9 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
     refined = None
     if arguments.refine:
         predictor = Innovation() if arguments.predictor == "innovation" else OutputError()
-        # Means are not offsets, and a continuous-time method leaves what is left of them alone.
-        free = None if offset is None else "free"
+        # Means are not offsets: what they leave differs from record to record, and a
+        # continuous-time method leaves it alone.
+        free = None if offset is None else "per record"
         refined = refine(fit, train, predictor=predictor, output_offset=free)
         fits["refined"] = refined
     scores = {name: _scores(found, train, test) for name, found in fits.items()}

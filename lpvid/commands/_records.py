@@ -120,10 +120,10 @@ def any_method(
     )
 
 
-def with_rest(offset: Offset, rest: Float[Array, " ny"]) -> Offset:
+def with_rest(offset: Offset, rest: Float[Array, "*record ny"]) -> Offset:
     """The offsets as a fit knows them: the means, and what they have left of the outputs'.
 
-    The mean of a record is not quite its offset: a slow response moves it. One rest for all
-    records, as the fit estimates it.
+    The mean of a record is not quite its offset: a slow response moves it. The rest is of each
+    record, or one for all where the fit estimates it so.
     """
-    return Offset(u=offset.u, y=offset.y + rest[None])
+    return Offset(u=offset.u, y=offset.y + (rest[None] if rest.ndim == 1 else rest))

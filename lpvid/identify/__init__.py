@@ -5,6 +5,7 @@ from lpvid.identify._fit import Fit as Fit
 from lpvid.identify._fit import StandardDeviations as StandardDeviations
 from lpvid.identify._identify import identify as identify
 from lpvid.identify._initial_state import estimate_initial_state as estimate_initial_state
+from lpvid.identify._initial_state import offset_level as offset_level
 from lpvid.identify._initial_state import simulation_fit as simulation_fit
 from lpvid.identify._innovation import InnovationModel as InnovationModel
 from lpvid.identify._methods import CVA as CVA

@@ -115,11 +115,32 @@ def simulation_fit(model: Any, data: IOData) -> Float[Array, " ny"]:
     return 100.0 * jnp.maximum(1.0 - jnp.sqrt(missed / moved), 0.0)
 
 
+def offset_level(offset: Float[Array, "*record ny"], data: IOData) -> Float[Array, "time ny"]:
+    """A fit's output offset over time, one for all records or one for each.
+
+    Args:
+        offset: (ny,) or (record, ny).
+        data: the records.
+
+    Raises:
+        ValueError: offsets of another number of records.
+    """
+    if offset.ndim == 1:
+        return jnp.broadcast_to(offset, (data.n_samples, offset.shape[0]))
+    if offset.shape[0] != len(data.lengths):
+        raise ValueError(
+            f"data: the fit has offsets of {offset.shape[0]} records, one each, and there are "
+            f"{len(data.lengths)}: give the records it was made from, or a fit with one offset for "
+            "all."
+        )
+    return jnp.repeat(offset, jnp.asarray(data.lengths), axis=0, total_repeat_length=data.n_samples)
+
+
 def _resolved(item: Any, data: IOData) -> tuple[StateSpace | LPVStateSpace, IOData]:
     """The model itself at the data's sample time, and the data it is for."""
     offset = getattr(item, "output_offset", None)
     if offset is not None:
-        data = data.replace(y=data.y - offset[None])
+        data = data.replace(y=data.y - offset_level(jnp.asarray(offset), data))
     model = item
     for name in ("model", "state_space"):
         model = getattr(model, name, model)

@@ -18,13 +18,15 @@ from lpvid.models._state_space import Numbers
 class NonlinearModel(eqx.Module):
     """ẋ = f(plant, x, u), y = h(plant, x, u): any plant, to simulate, predict and refine.
 
-    `refine` estimates the plant's inexact arrays, by output error or by innovation. The states that
-    it simulates, estimates and corrects are the plant's less those at `rest`.
+    `refine` estimates the plant's inexact arrays, by output error or by innovation. Arrays that
+    `dynamics` or `output` hold, where they are modules, are constants: what is to be estimated
+    belongs in `plant`, such as `{"arm": arm, "sensor": sensor}`. The states that it simulates,
+    estimates and corrects are the plant's less those at `rest`.
 
     Attributes:
         plant: any pytree, such as an arm of `lpvid.mechanics` or a dictionary of numbers.
         dynamics: (plant, x, u) → ẋ, smooth in all three.
-        output: (plant, x, u) → y at the same sample, (ny,).
+        output: (plant, x, u) → y at the same sample, (ny,): of one output `x[:1]`, not `x[0]`.
         rest: the plant's state where the model's is zero. A search begins here: h must be smooth.
         substeps: Runge–Kutta steps a sample; |λ| dt / substeps < 2.61 for the fastest pole λ.
 
@@ -91,6 +93,9 @@ class NonlinearModel(eqx.Module):
             u: input, held.
             dt: sample time, s.
 
+        Raises:
+            ValueError: `dynamics` or `output` return another shape than they have to.
+
         Example:
             >>> from lpvid.models import NonlinearModel
             >>> lag = NonlinearModel(
@@ -104,14 +109,28 @@ class NonlinearModel(eqx.Module):
         length = jnp.asarray(dt, float) / self.substeps
 
         def substep(state, _):
-            moved = runge_kutta_step(lambda x, u: self.dynamics(self.plant, x, u), state, u, length)
-            return moved, None
+            return runge_kutta_step(self._rate, state, u, length), None
 
         if self.substeps == 1:
             end = substep(begin, None)[0]
         else:
             end = jax.lax.scan(substep, begin, length=self.substeps)[0]
-        return end - rest, self.output(self.plant, begin, u)
+        y = jnp.asarray(self.output(self.plant, begin, u))
+        if y.ndim != 1:
+            raise ValueError(
+                f"output: it returns an array of shape {y.shape}; give all outputs in one of shape "
+                "(ny,), a single one as x[:1] or jnp.stack([...])."
+            )
+        return end - rest, y
+
+    def _rate(self, x: Float[Array, " nx"], u: Float[Array, " nu"]) -> Float[Array, " nx"]:
+        rate = jnp.asarray(self.dynamics(self.plant, x, u))
+        if rate.shape != x.shape:
+            raise ValueError(
+                f"dynamics: it returns an array of shape {rate.shape}; ẋ of shape {x.shape} is "
+                "needed, one value for each state in rest."
+            )
+        return rate
 
     def simulate(
         self, *, u: Numbers, dt: float, x0: Numbers | None = None

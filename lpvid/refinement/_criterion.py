@@ -160,12 +160,19 @@ class Problem(eqx.Module):
             rows = _orthonormal((by_own @ factor.T).reshape(own.shape[0], -1))
             flat = by_shared.reshape(kept.shape[0], -1)
             left = flat - (flat @ rows.T) @ rows
-            # What the first state explains but for rounding is nothing that the record tells.
-            size, rest = (jnp.sum(part**2, axis=1, keepdims=True) for part in (flat, left))
-            left = jnp.where(rest > _TOLD * size, left, 0.0)
-            return left.reshape(by_shared.shape), rows.reshape(by_own.shape)
+            left = left.reshape(by_shared.shape)
+            return without_rounding(left, by_shared), rows.reshape(by_own.shape)
 
         return over_records(one, (self.records, self.mask, at.own, self.x0))
+
+
+def without_rounding(
+    left: Float[Array, "*record coordinate time ny"],
+    whole: Float[Array, "*record coordinate time ny"],
+) -> Float[Array, "*record coordinate time ny"]:
+    """What states leave of sensitivities; what is but rounding is nothing that a record tells."""
+    size, rest = (jnp.sum(part**2, axis=(-2, -1), keepdims=True) for part in (whole, left))
+    return jnp.where(rest > _TOLD * size, left, 0.0)
 
 
 def _orthonormal(own: Float[Array, "own sample"]) -> Float[Array, "own sample"]:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from lpvid.models import (
     GrayBoxLPV,
     LPVStateSpace,
+    NonlinearModel,
     can_step,
     one_step_predictor,
     steps_of,
@@ -24,14 +25,16 @@ from lpvid.refinement._parameterisation import (
     gain_names,
 )
 
-# The one leaf of an LPV model that is estimated.
-_ESTIMATED = {LPVStateSpace: "coefficients", GrayBoxLPV: "parameters"}
+_LPV = (LPVStateSpace, GrayBoxLPV)
+# The one part of a model that is estimated; of other modules all is.
+_ESTIMATED = {LPVStateSpace: "coefficients", GrayBoxLPV: "parameters", NonlinearModel: "plant"}
 
 
 class ModuleParameterisation(AbstractParameterisation):
     """A module: its inexact arrays are the values, leaf by leaf; then the entries of K.
 
-    Of an `LPVStateSpace` the coefficients alone are, of a `GrayBoxLPV` its parameters. Without K
+    Of an `LPVStateSpace` the coefficients alone are, of a `GrayBoxLPV` its parameters, of a
+    `NonlinearModel` what its plant holds. Without K
     the module's `simulate(u=, dt=, x0=)` gives the output, or where it has none its
     `step(x, u, dt=)`; with K its step.
 
@@ -57,7 +60,8 @@ class ModuleParameterisation(AbstractParameterisation):
         found = []
         for place, (path, leaf) in enumerate(paths):
             name = jax.tree_util.keystr(path).lstrip(".")
-            if eqx.is_inexact_array(leaf) and only in (None, name):
+            part = jax.tree_util.keystr(path[:1]).lstrip(".")
+            if eqx.is_inexact_array(leaf) and only in (None, part):
                 found.append((name, leaf, place))
         return found
 
@@ -129,7 +133,7 @@ class ModuleParameterisation(AbstractParameterisation):
     ) -> Float[Array, "time ny"]:
         """Simulation or prediction, frozen where κ rests: one matrix exponential for the record."""
         model, gain = self.build(prepared), self.innovation_gain(prepared)
-        if type(self.model) in _ESTIMATED:
+        if type(self.model) in _LPV:
             return self._along_schedule(model, gain, record, x0)
         if gain is not None or not simulates(self.model):
             along = steps_of(model, u=record.u, kappa=record.kappa, dt=self.dt)
@@ -189,9 +193,10 @@ def simulates(model: Any) -> bool:
     return callable(simulate) and {"u", "dt"} <= set(inspect.signature(simulate).parameters)
 
 
-def needs_schedule(model: Any) -> bool:
-    """Whether it cannot do without κ."""
-    method = model.simulate if simulates(model) else model.step
+def needs_schedule(model: Any, by_steps: bool) -> bool:
+    """Whether it cannot do without κ, simulated or, where it can step, `by_steps`."""
+    by_steps = by_steps and can_step(model)
+    method = model.simulate if simulates(model) and not by_steps else model.step
     parameter = inspect.signature(method).parameters.get("kappa")
     return parameter is not None and parameter.default is inspect.Parameter.empty
 
@@ -203,4 +208,4 @@ def is_module(model: Any) -> bool:
 
 def can_be_corrected(model: Any) -> bool:
     """Whether its state can be corrected from sample to sample."""
-    return type(model) in _ESTIMATED or can_step(model)
+    return type(model) in _LPV or can_step(model)

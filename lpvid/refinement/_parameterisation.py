@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from lpvid.data import IOData
 from lpvid.models import AbstractStructure, StateSpace, StructuredModel, one_step_predictor
@@ -24,11 +24,13 @@ class Record(eqx.Module):
         u: input.
         y: output.
         kappa: scheduling, or None.
+        place: which of the data's records it is (or a piece of).
     """
 
     u: Float[Array, "*record time nu"]
     y: Float[Array, "*record time ny"]
     kappa: Float[Array, "*record time nk"] | None
+    place: Int[Array, "*record"]
 
 
 class AbstractParameterisation(eqx.Module):
@@ -276,4 +278,5 @@ def padded_records(data: IOData) -> tuple[Record, Array]:
 
     mask = np.arange(longest)[None, :] < np.asarray(data.lengths)[:, None]
     kappa = None if data.kappa is None else stack(data.kappa, "edge")
-    return Record(stack(data.u), stack(data.y), kappa), jnp.asarray(mask)
+    places = jnp.arange(len(data.lengths))
+    return Record(stack(data.u), stack(data.y), kappa, places), jnp.asarray(mask)

@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from lpvid._results import Status
 from lpvid._solve import Bounds
 from lpvid.data import IOData
-from lpvid.refinement._offset import taken_out
+from lpvid.refinement._offset import taken_out, without_constants
 from lpvid.refinement._parameterisation import padded_records
 from lpvid.refinement._refined import Refined
 from lpvid.refinement._search import search
@@ -116,15 +116,20 @@ def profile_likelihood(
         )
     offset = taken_out(refined)
     if offset is not None:
-        data = data.replace(y=data.y - offset[None])
-    if task.parameterisation.gauge(refined.parameters) is not None:
-        raise ValueError(
-            "refined: the entries of a black box depend on the basis of its state; profile a "
-            "StructuredModel."
-        )
+        data = without_constants(data, offset)
     if name not in refined.parameter_names:
         raise ValueError(
             f"name: there is no parameter {name!r}; there are {', '.join(refined.parameter_names)}."
+        )
+    if task.parameterisation.gauge(refined.parameters) is not None:
+        if name.startswith(("D", "offset")):
+            raise ValueError(
+                f"name: {name!r} of a black box has no profile: it is searched in coordinates that "
+                "mix all values. Use its confidence_intervals(), or profile a StructuredModel."
+            )
+        raise ValueError(
+            "refined: the entries of a black box depend on the basis of its state; profile a "
+            "StructuredModel."
         )
     row = refined.parameter_names.index(name)
     column = int(np.argmax(np.asarray(task.selection.matrix[row])))

@@ -18,7 +18,7 @@ from lpvid.models import (
     StructuredModel,
     balancing,
     can_step,
-    steps_of,
+    takes_schedule,
 )
 from lpvid.refinement._modules import (
     ModuleParameterisation,
@@ -184,8 +184,8 @@ def _module(model: Any, data: IOData, estimates_gain: bool, gain: Array | None) 
             "simulate alone. Give it step(x, u, dt=) -> (state one sample later, output now), "
             "describe it as a NonlinearModel, or use OutputError()."
         )
-    if data.kappa is None and needs_schedule(model):
-        raise ValueError("data: an LPV model needs the scheduling; give kappa= to IOData.")
+    if data.kappa is None and needs_schedule(model, estimates_gain):
+        raise ValueError(f"data: {name} needs the scheduling; give kappa= to IOData.")
     dt = getattr(model, "dt", 0.0)
     if isinstance(dt, float) and dt > 0.0 and not np.isclose(dt, data.dt, rtol=1e-9):
         raise ValueError(
@@ -193,7 +193,8 @@ def _module(model: Any, data: IOData, estimates_gain: bool, gain: Array | None) 
             "check the data's sample time."
         )
     states = int(getattr(model, "n_states", getattr(model, "nx", 0)))
-    if estimates_gain and not states:
+    # A module that simulates starts where it likes; one that steps is given its first state.
+    if not states and (estimates_gain or not simulates(model)):
         raise ValueError(
             f"model: {name} has a step, but n_states does not say how many states it has; name "
             "their number."
@@ -215,19 +216,37 @@ def _check_module(
     """Raise where shapes do not fit, seen on two samples."""
     states = kind.states
     kappa = None if data.kappa is None else data.kappa[:2]
-    record = Record(data.u[:2], data.y[:2], kappa)
+    record = Record(data.u[:2], data.y[:2], kappa, jnp.asarray(0))
     if can_step(kind.model) and (estimates_gain or not simulates(kind.model)):
-        along = steps_of(kind.model, u=record.u, kappa=kappa, dt=data.dt)
-        now = jax.tree.map(lambda signal: signal[0], along.signals)
-        after, _ = jax.eval_shape(along.step, jnp.zeros(states), now)
-        if after.shape != (states,):
-            raise ValueError(
-                f"model: its step leads from {states} states to shape {after.shape}; ({states},) "
-                "is needed, n_states (or nx) long."
-            )
+        _check_step(kind, record)
     shape = jax.eval_shape(kind.respond, values, record, jnp.zeros(states))
     if shape.shape != (2, data.ny):
         raise ValueError(
             f"model: its output has shape {shape.shape} for two samples; this data needs "
             f"(2, {data.ny})."
+        )
+
+
+def _check_step(kind: ModuleParameterisation, record: Record) -> None:
+    """Raise where a step does not lead from a state to the next one and an output."""
+    model, states = kind.model, kind.states
+    options: dict[str, Any] = {"dt": jnp.asarray(kind.dt)}
+    if record.kappa is not None and takes_schedule(model.step):
+        options["kappa"] = record.kappa[0]
+    found = jax.eval_shape(lambda x, u: model.step(x, u, **options), jnp.zeros(states), record.u[0])
+    if not isinstance(found, tuple) or len(found) != 2:
+        what = f"{len(found)} values" if isinstance(found, tuple) else f"a {type(found).__name__}"
+        raise ValueError(
+            f"model: the step of {type(model).__name__} returns {what}; a tuple of two is needed, "
+            "(state one sample later, output at this one)."
+        )
+    if found[0].shape != (states,):
+        raise ValueError(
+            f"model: its step leads from {states} states to shape {found[0].shape}; ({states},) is "
+            "needed, n_states (or nx) long."
+        )
+    if found[1].shape != record.y.shape[1:]:
+        raise ValueError(
+            f"model: its step gives an output of shape {found[1].shape}; this data needs "
+            f"{record.y.shape[1:]}, a single output as x[:1]."
         )

@@ -15,7 +15,12 @@ from lpvid._solve import Bounds
 from lpvid.data import IOData
 from lpvid.refinement._coordinates import Selection, Ties, matching, select
 from lpvid.refinement._losses import AbstractLoss, SquaredLoss
-from lpvid.refinement._offset import WithOffset, starting_offset
+from lpvid.refinement._offset import (
+    Constants,
+    WithOffset,
+    starting_offset,
+    without_constants,
+)
 from lpvid.refinement._parameterisation import (
     AbstractParameterisation,
     LinearParameterisation,
@@ -75,10 +80,11 @@ def refine(
             a black box, `fixed` and `tied` may name entries of D and offsets alone.
         initial_state: `"free"` (estimated, one a record), `"zero"`, or known states (nx,) or
             (record, nx).
-        output_offset: `"free"` (a constant in each output, common to all records, is estimated as
-            `offset[k]`, from the mean on) or known constants (ny,); by default, what the fit that
-            is refined did, so that an estimated offset stays an unknown and the intervals of the
-            gain account for it.
+        output_offset: a constant in each output, estimated from the mean on: `"free"`, one common
+            to all records, as `offset[k]`, or `"per record"`, one of each record r, as
+            `offset[r,k]`; or known constants, (ny,) or (record, ny), such as the `y` of a
+            `lpvid.data.Offset`. By default, what the fit that is refined did, so that an estimated
+            offset stays an unknown and the intervals of the gain account for it.
         max_steps: limit on the trial steps.
         throw: raise where no fit came out. `False` returns it with its status, and warns.
 
@@ -112,13 +118,13 @@ def refine(
         raise ValueError(f"loss={loss!r}: give SquaredLoss() or HuberLoss().")
     if max_steps < 1:
         raise ValueError(f"max_steps: at least 1 is needed, got {max_steps}.")
-    offset, estimated = starting_offset(model, output_offset, data.y)
+    offset, estimated = starting_offset(model, output_offset, data)
     if offset is not None:
-        data = data.replace(y=data.y - offset[None])
+        data = without_constants(data, offset)
     start = recognise(model, data, predictor)
     if estimated and offset is not None:
         kind = WithOffset(start.parameterisation, offset, channel_sizes(data.y))
-        start = Start(kind, jnp.concatenate([start.values, offset]))
+        start = Start(kind, jnp.concatenate([start.values, offset.reshape(-1)]))
     task, chosen = prepare(start, data, predictor, loss, bounds, fixed, tied, initial_state)
     records = padded_records(data)
     own = task.own(*records[1].shape)
@@ -191,13 +197,18 @@ def _check_basis_free(kind: AbstractParameterisation, fixed: Sequence[str], tied
     """Raise where something is to be held that depends on the basis of the state."""
     groups = [[pattern] if isinstance(pattern, str) else pattern for pattern in tied]
     for pattern in (*fixed, *(pattern for group in groups for pattern in group)):
-        names = [kind.names[i] for i in matching(kind.names, pattern, "fixed, tied")]
-        if any(not name.startswith(("D", "offset")) for name in names):
+        if not _basis_free(kind, pattern, "fixed, tied"):
             raise ValueError(
                 f"fixed, tied: {pattern!r} names entries that depend on the basis of the state, "
                 "which the search of a black box changes; hold entries of D or offsets only, or "
                 "give a StructuredModel."
             )
+
+
+def _basis_free(kind: AbstractParameterisation, pattern: str, argument: str) -> list[str]:
+    """The names that a pattern matches, none if any depends on the basis of the state."""
+    names = [kind.names[i] for i in matching(kind.names, pattern, argument)]
+    return names if all(name.startswith(("D", "offset")) for name in names) else []
 
 
 @jax.jit
@@ -218,6 +229,12 @@ def _bounds(
     if not given:
         return lower, upper
     if _is_black_box(kind):
+        own = [name for pattern in given for name in _basis_free(kind, pattern, "bounds")]
+        if own:
+            raise ValueError(
+                f"bounds: {', '.join(own)} cannot be bounded in a black box, which is searched in "
+                "coordinates that mix all values; hold it (fixed=), or give a StructuredModel."
+            )
         raise ValueError(
             "bounds: the entries of a black box depend on the basis of its state, so they have no "
             "bounds; give a StructuredModel, for example of a ModalStructure."
@@ -253,9 +270,7 @@ def _initial_state(
     return False, jnp.broadcast_to(states, zero.shape)
 
 
-def as_refined(
-    task: Task, outcome: Outcome, data: IOData, offset: Float[Array, " ny"] | None
-) -> Refined:
+def as_refined(task: Task, outcome: Outcome, data: IOData, offset: Constants | None) -> Refined:
     """The public record of an outcome."""
     kind = task.parameterisation
     if isinstance(kind, WithOffset):

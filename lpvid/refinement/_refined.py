@@ -25,8 +25,9 @@ class Refined(eqx.Module):
             `lpvid.analysis.propagate(function, parameters, covariance)`.
         robust_covariance: the same for noise of any colour that is independent of the input.
         x0: initial states, (record, nx).
-        output_offset: constant to add to the model's outputs, (ny,), one of the parameters where
-            it is estimated; None where there is none.
+        output_offset: constant to add to the model's outputs, (ny,), or (record, ny) where each
+            record has its own; one of the parameters where it is estimated, None where there is
+            none.
         innovation_gain: K, (nx, ny), constant along moving schedules too; None where it was not
             estimated.
         noise_covariance: of the residual, corrected for the unknowns estimated, (ny, ny).
@@ -46,7 +47,7 @@ class Refined(eqx.Module):
     covariance: Float[Array, "parameter parameter"]
     robust_covariance: Float[Array, "parameter parameter"]
     x0: Float[Array, "record nx"]
-    output_offset: Float[Array, " ny"] | None
+    output_offset: Float[Array, "*record ny"] | None
     innovation_gain: Float[Array, "nx ny"] | None
     noise_covariance: Float[Array, "ny ny"]
     residual: Float[Array, "time ny"]

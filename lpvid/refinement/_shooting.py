@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lpvid.refinement._chain import ChainEquations, eliminate
-from lpvid.refinement._criterion import Problem, over_records
+from lpvid.refinement._criterion import Problem, over_records, without_rounding
 from lpvid.refinement._levenberg_marquardt import Unknowns
 from lpvid.refinement._losses import Residual
 from lpvid.refinement._parameterisation import Record
@@ -243,9 +243,9 @@ class Shooting(eqx.Module):
         shared = jnp.concatenate([jnp.eye(count), jnp.zeros((count, nx))], axis=1)
         states = eliminated.states(shared, False, last)
         moved = jnp.einsum("rkstn,rksc->rcktn", y[:, :, :nx], states)
-        moved = moved.at[:, :count].add(jnp.swapaxes(y[:, :, nx:], 1, 2))
-        moved = self._whole(moved)
-        return moved[:, :count], moved[:, count:]
+        held = jnp.swapaxes(y[:, :, nx:], 1, 2)
+        moved = self._whole(moved.at[:, :count].add(held))
+        return without_rounding(moved[:, :count], self._whole(held)), moved[:, count:]
 
 
 def unweighted(problem: Problem, pieces: Pieces) -> Shooting:
@@ -267,4 +267,5 @@ def cut_up(records: Record, mask: Array, length: int, overlap: int) -> Pieces:
     # As in `padded_records`: the schedule stays where it was, signals end.
     kappa = None if records.kappa is None else cut(records.kappa, "edge")
     joined = jnp.pad(mask[:, np.arange(1, count) * size], ((0, 0), (0, 1)))
-    return Pieces(Record(cut(records.u), cut(records.y), kappa), joined)
+    place = jnp.broadcast_to(records.place[:, None], joined.shape)
+    return Pieces(Record(cut(records.u), cut(records.y), kappa, place), joined)

@@ -1,5 +1,7 @@
 """Prediction against a loop over time with the definition of the k-step predictor."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from lpvid.analysis import fit_by_record, horizon_errors, nrmse_fit, predict
-from lpvid.models import StateSpace
+from lpvid.models import NonlinearModel, StateSpace
 
 RNG = np.random.default_rng(5)
 A = np.array([[0.9, 0.2, 0.0], [-0.3, 0.7, 0.1], [0.0, 0.1, 0.5]])
@@ -93,6 +95,46 @@ def test_errors_over_horizons_are_those_of_predict():
         expected = 1.0 - np.linalg.norm(Y - found, axis=0) / np.linalg.norm(off_mean, axis=0)
         np.testing.assert_allclose(fit, 100.0 * expected, rtol=1e-9)
     assert horizon_errors(MODEL, u=U, y=Y).rmse.shape == (1, 2)
+
+
+class Fitted(NamedTuple):
+    """What a fit has that prediction asks for."""
+
+    model: object
+    innovation_gain: np.ndarray | None
+    output_offset: np.ndarray | None
+
+
+@pytest.mark.parametrize("offset", [np.array([2.0, -3.0]), np.array([[2.0, -3.0], [0.5, 7.0]])])
+def test_a_fit_predicts_with_its_gain_and_offset(offset):
+    level = np.repeat(np.broadcast_to(offset, (2, 2)), LENGTHS, axis=0)
+    along = {"u": U, "x0": X0, "lengths": LENGTHS}
+    fit = Fitted(MODEL, K, offset)
+    expected = predict(MODEL, y=Y, gain=K, horizon=2, **along) + level
+    np.testing.assert_allclose(predict(fit, y=Y + level, horizon=2, **along), expected, atol=1e-12)
+    simulated = predict(fit, **along)
+    np.testing.assert_allclose(simulated, predict(MODEL, **along) + level, atol=1e-12)
+    errors = horizon_errors(fit, y=Y + level, **along)
+    np.testing.assert_allclose(
+        errors.rmse, horizon_errors(MODEL, y=Y, gain=K, **along).rmse, atol=1e-12
+    )
+    # What is given goes before what was fitted.
+    other = predict(fit, y=Y, gain=0.0 * K, output_offset=[0.0, 0.0], **along)
+    np.testing.assert_allclose(other, predict(MODEL, **along), atol=1e-12)
+    with pytest.raises(ValueError, match=r"\(2,\), or \(3, 2\) for an offset of each record"):
+        predict(fit, u=U, output_offset=np.ones((2, 2)), lengths=(20, 20, 20))
+
+
+def test_a_model_in_continuous_time_is_given_the_sample_time():
+    continuous = MODEL.to_continuous()
+    along = {"u": U, "y": Y, "gain": K, "horizon": 3}
+    found = predict(continuous, dt=0.1, **along)
+    np.testing.assert_allclose(found, predict(MODEL, **along), atol=1e-9)
+    lag = NonlinearModel(
+        {"rate": 2.0}, lambda p, x, u: u - p["rate"] * x, lambda p, x, u: x, rest=[0.0]
+    )
+    with pytest.raises(ValueError, match="dt: the model is in continuous time"):
+        predict(lag, u=U[:, :1])
 
 
 def test_gradients_in_the_gain_and_jit():

@@ -60,6 +60,31 @@ def test_matrices_and_modes_come_with_intervals_that_hold_the_truth(capsys, tmp_
     np.testing.assert_array_equal(mass, content["mass"]["value"])
 
 
+@pytest.mark.slow
+def test_removed_offsets_are_estimated_with_the_model(capsys, tmp_path):
+    # Hardly damped: over 5 s the mean of the motion is far from the sensor's zero.
+    system = MassSpringDamper([[2.0]], [[0.4]], [[8.0]])
+    rng, zero = np.random.default_rng(2), 0.7
+    u = np.asarray(random_steps(jax.random.key(3), 300, 1, dt=DT))
+    y = np.asarray(system.state_space().simulate(u=u, dt=DT, x0=np.array([0.5, 0.0])))
+    path, figures = tmp_path / "run.csv", tmp_path / "figures.json"
+    table = np.column_stack([u, y + zero + 1e-3 * rng.standard_normal(y.shape)])
+    np.savetxt(path, table, delimiter=",", header="f,d", comments="")
+    argv = ["gray-box", str(path), "--input", "f", "--output", "d", "--dt", str(DT), "--tau", "0.2"]
+    argv += ["--block-rows", "5", "--remove-offsets", "--json", str(figures)]
+    assert main(argv) == 0
+    content = json.loads(figures.read_text())
+    for name, truth in (("mass", 2.0), ("damping", 0.4), ("stiffness", 8.0)):
+        value, std = (np.array(content[name][key]).item() for key in ("value", "std"))
+        assert abs(value - truth) < 4.0 * std < 0.1 * truth, name
+    # At rest under the mean force, the mass is as far from its sensor's zero as the spring gives.
+    rest = content["offsets"]["y"][0][0] - content["offsets"]["u"][0][0] / 8.0
+    assert rest == pytest.approx(zero, abs=2e-3)
+    assert content["noise_std"] == pytest.approx([1e-3], rel=0.2)
+    assert content["unidentified"] == [False, False, False]
+    assert min(content["fit"]["refined"]["train"] + content["fit"]["refined"]["test"]) > 97.0
+
+
 @pytest.mark.parametrize(
     ("argv", "words"),
     [

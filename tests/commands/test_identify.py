@@ -71,6 +71,32 @@ def test_refinement_takes_offsets_out_once(capsys, tmp_path):
     assert content["poles"][0]["re"] == pytest.approx(0.995, abs=5e-4)
 
 
+def slow_lag(path, offset, seed, n=600):
+    """A lag of 50 samples, from a start far from rest: the mean of its output is not its offset."""
+    rng = np.random.default_rng(seed)
+    u, x = np.repeat(rng.standard_normal(n // 10), 10), np.zeros(n)
+    x[0] = (-1.0) ** seed
+    for k in range(n - 1):
+        x[k + 1] = 0.98 * x[k] + 0.02 * u[k]
+    table = np.c_[DT * np.arange(n), u, x + offset + 1e-3 * rng.standard_normal(n)]
+    np.savetxt(path, table, delimiter=",", header="t,u,y", comments="")
+    return str(path)
+
+
+@pytest.mark.slow
+def test_every_file_has_an_offset_of_its_own(capsys, tmp_path):
+    offsets = (1.0, -2.0)
+    files = [slow_lag(tmp_path / f"{k}.csv", offset, k) for k, offset in enumerate(offsets)]
+    argv = [*files, "--input", "u", "--output", "y", "--time", "t", "--order", "1", "--refine"]
+    content, _ = identified(capsys, tmp_path, [*argv, "--method", "continuous-moesp"])
+    # The means of the inputs are taken out too, and with them what they make of the output.
+    found = np.array(content["offsets"]["y"]) - np.array(content["offsets"]["u"])
+    np.testing.assert_allclose(found[:, 0], offsets, atol=0.01)
+    assert content["poles"][0]["continuous"]["re"] == pytest.approx(np.log(0.98) / DT, rel=0.02)
+    # Noise of 1e-3 on an output of more than 0.1.
+    assert min(content["fit"]["train"] + content["fit"]["test"]) > 99.0
+
+
 @pytest.mark.slow
 def test_several_files_are_several_records(capsys, tmp_path):
     files = [write_table(tmp_path / f"{k}.csv", np.zeros(n), k) for k, n in enumerate((500, 400))]

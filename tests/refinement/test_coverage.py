@@ -9,7 +9,7 @@ from lpvid._results import Status
 from lpvid.data import IOData
 from lpvid.identify import PastOutputMOESP, identify
 from lpvid.models import FunctionStructure, StateSpace, StructuredModel
-from lpvid.refinement import HuberLoss, Innovation, SquaredLoss, refine
+from lpvid.refinement import HuberLoss, Innovation, OutputError, SquaredLoss, refine
 
 # Shares of 400 runs: a 95 % interval covers 95 ± 3.3 % of them but for one time in a thousand.
 RUNS, MARGIN = 400, 0.033
@@ -87,6 +87,11 @@ def test_an_offset_that_an_integrator_hides_is_not_identified():
         fit = refine(truth, data, output_offset="free", throw=False)
     assert abs(fit.parameters[0] - 2.0) < 4.0 * fit.standard_errors[0] < 0.1
     assert np.isinf(fit.standard_errors[1])
+    with pytest.warns(UserWarning, match=r"Not identified: offset\[0\]"):
+        pieces = refine(
+            truth, data, output_offset="free", predictor=OutputError(shooting=25), throw=False
+        )
+    np.testing.assert_allclose(pieces.standard_errors, fit.standard_errors, rtol=1e-3)
     # From rest it can be told.
     known = refine(truth, data, output_offset="free", initial_state="zero")
     assert abs(known.output_offset[0] - 5.0) < 4.0 * known.standard_errors[1]

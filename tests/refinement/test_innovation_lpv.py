@@ -98,7 +98,7 @@ RESTING = IOData(u=MOVING.u, y=MOVING.y, dt=DT, kappa=np.full(60, 0.4))
 
 
 def responds(kind, values, data):
-    each, x0 = Record(data.u, data.y, data.kappa), jnp.asarray(START)
+    each, x0 = Record(data.u, data.y, data.kappa, jnp.asarray(0)), jnp.asarray(START)
     return jax.jit(lambda v: kind.respond(v, each, x0))(jnp.asarray(values))
 
 
@@ -126,7 +126,7 @@ def test_without_dependence_on_the_schedule_it_is_the_linear_predictor():
     still = oscillator(COEFFICIENTS.at[1].set(0.0))
     lpv, values = recognise(still, MOVING, Innovation(GAIN))
     linear, same = recognise(StructuredModel(STRUCTURE, [4.0, 0.5]), MOVING, Innovation(GAIN))
-    each = Record(MOVING.u, MOVING.y, MOVING.kappa)
+    each = Record(MOVING.u, MOVING.y, MOVING.kappa, jnp.asarray(0))
 
     def respond(kind):
         def function(v):

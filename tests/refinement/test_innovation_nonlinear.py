@@ -1,5 +1,7 @@
 """Innovation fits of nonlinear mechanics: pendulums in closed loop, the library's own arms."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -65,7 +67,7 @@ def test_the_prediction_is_that_of_the_recursion_and_so_are_its_slopes():
     model = upright(**TRUTH)
     kind, values = recognise(model, DATA, Innovation(GAIN))
     assert kind.names[:3] == ("plant['damping']", "plant['gain']", "plant['toppling']")
-    each, x0 = Record(DATA.u, DATA.y, None), jnp.array([0.1, 0.0])
+    each, x0 = Record(DATA.u, DATA.y, None, jnp.asarray(0)), jnp.array([0.1, 0.0])
 
     def respond(v):
         y = kind.respond(v[:5], each, v[5:])
@@ -115,6 +117,17 @@ class Forgetful(eqx.Module):
         return x[:1] + dt * self.outflow * u, x[:1]
 
 
+class Scheduled(eqx.Module):
+    """Needs κ; returns what `returned` says of its state and its output."""
+
+    outflow: Float[Array, ""]
+    returned: Callable = eqx.field(static=True, default=lambda x, y: (x, y))
+    n_states: int = eqx.field(static=True, default=1)
+
+    def step(self, x, u, *, dt, kappa):
+        return self.returned(x + dt * kappa * (u - self.outflow * x), x)
+
+
 class Simulated(eqx.Module):
     """Nothing but a simulation."""
 
@@ -125,6 +138,31 @@ class Simulated(eqx.Module):
         return jax.lax.scan(lambda x, u: (x + dt * (u - self.outflow * x), x), x0, u)[1]
 
 
+class Sensor(eqx.Module):
+    """A gain that the output's function holds."""
+
+    gain: Float[Array, ""]
+
+    def __call__(self, plant, x, u):
+        return self.gain * x[:1]
+
+
+def test_what_is_estimated_is_in_the_plant():
+    sensor = Sensor(jnp.asarray(2.0))
+    held = NonlinearModel(TRUTH, motion, sensor, rest=[0.0, 0.0])
+    kind, values = recognise(held, DATA, OutputError())
+    assert kind.names == ("plant['damping']", "plant['gain']", "plant['toppling']")
+    assert kind.build(values + 1.0).output.gain == 2.0
+    plant = {"arm": TRUTH, "sensor": sensor}
+    declared = NonlinearModel(
+        plant,
+        lambda p, x, u: motion(p["arm"], x, u),
+        lambda p, x, u: p["sensor"](p, x, u),
+        rest=[0.0, 0.0],
+    )
+    assert "plant['sensor'].gain" in recognise(declared, DATA, OutputError())[0].names
+
+
 def test_what_a_module_needs():
     one = jnp.asarray(1.0)
     with pytest.raises(ValueError, match="offers simulate alone"):
@@ -133,8 +171,23 @@ def test_what_a_module_needs():
         refine(Tank(one, 0), DATA, predictor=Innovation())
     with pytest.raises(ValueError, match="leads from 2 states"):
         refine(Forgetful(one), DATA, predictor=Innovation())
-    with pytest.raises(ValueError, match="its output has shape"):
+    with pytest.raises(ValueError, match=r"output of shape \(2,\); this data needs \(1,\)"):
         refine(Tank(one, 2), DATA, predictor=Innovation())
+    scheduled = IOData(u=DATA.u, y=DATA.y, kappa=np.ones(40), dt=DT)
+    with pytest.raises(ValueError, match="n_states does not say"):
+        refine(Tank(one, 0), DATA)
+    with pytest.raises(ValueError, match="Scheduled needs the scheduling"):
+        refine(Scheduled(one), DATA)
+    with pytest.raises(ValueError, match="kappa: the model depends on a schedule"):
+        predict(Scheduled(one), u=DATA.u, y=DATA.y, gain=[[1.0]], dt=DT)
+    with pytest.raises(ValueError, match="returns 3 values; a tuple of two is needed"):
+        refine(Scheduled(one, lambda x, y: (x, y, y)), scheduled)
+    with pytest.raises(ValueError, match="returns a ShapeDtypeStruct; a tuple of two"):
+        refine(Scheduled(one, lambda x, y: x), scheduled, predictor=Innovation())
+    with pytest.raises(ValueError, match=r"output: it returns an array of shape \(\)"):
+        refine(NonlinearModel(TRUTH, motion, lambda p, x, u: x[0], rest=[0.0, 0.0]), DATA)
+    with pytest.raises(ValueError, match=r"dynamics: it returns an array of shape \(1,\)"):
+        refine(NonlinearModel(TRUTH, angle, angle, rest=[0.0, 0.0]), DATA)
     with pytest.raises(ValueError, match="NonlinearModel"):
         refine(reference_two_link_arm(), DATA, predictor=Innovation())
     with pytest.raises(ValueError, match="step"):
@@ -153,7 +206,7 @@ def test_what_a_module_needs():
     # So is what output error compares with the record.
     data = IOData(u=u, y=u, dt=DT)
     kind, values = recognise(model, data, OutputError())
-    each = Record(data.u, data.y, None)
+    each = Record(data.u, data.y, None, jnp.asarray(0))
     np.testing.assert_allclose(kind.respond(values, each, jnp.zeros(1))[:, 0], levels, atol=1e-14)
 
 
@@ -190,7 +243,7 @@ def test_the_single_link_arm_is_what_it_simulates():
     np.testing.assert_allclose(model.simulate(u=u, dt=dt), y, atol=1e-10)
     # Predicted with the gain at zero it is the same, whatever was measured.
     kind, values = recognise(model, IOData(u=u, y=0.0 * y, dt=dt), Innovation())
-    each, x0 = Record(jnp.asarray(u), 0.0 * y, None), jnp.zeros(4)
+    each, x0 = Record(jnp.asarray(u), 0.0 * y, None, jnp.asarray(0)), jnp.zeros(4)
     found = jax.jit(lambda v: kind.respond(v, each, x0))(values)
     np.testing.assert_allclose(found, y, atol=1e-10)
 
@@ -235,7 +288,7 @@ def test_the_two_link_arm_in_closed_loop():
     wanted = ("bending", "payload", "K[3,0]", "K[4,1]")
     free = np.array([i for i, name in enumerate(kind.names) if any(w in name for w in wanted)])
     assert len(free) == 5
-    each, x0 = Record(data.u, data.y, None), jnp.zeros(7)
+    each, x0 = Record(data.u, data.y, None, jnp.asarray(0)), jnp.zeros(7)
 
     def residual(chosen):
         e = data.y - kind.respond(values.at[free].set(chosen), each, x0)

@@ -47,7 +47,7 @@ MOVING = record(300, np.linspace(0.0, 1.0, 300), 2)
 
 def test_records_at_rest_are_simulated_by_frozen_models():
     data = STILL[1]
-    each = Record(data.u, data.y, data.kappa)
+    each = Record(data.u, data.y, data.kappa, jnp.asarray(0))
     x0 = jnp.array([0.3, -0.2])
     outputs = [
         ModuleParameterisation(model(TRUTH), DT, 2, schedules).respond(jnp.asarray(TRUTH), each, x0)
