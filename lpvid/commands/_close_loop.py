@@ -38,7 +38,12 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
         structure = PortedModel(model, fitted)
     print(f"Structure {structure.name}; fitting and testing …", flush=True)
     found = loop.close_the_loop(
-        structure, data, test=test, split=split, progress=sys.stderr.isatty()
+        structure,
+        data,
+        test=test,
+        split=split,
+        hold=arguments.hold,
+        progress=sys.stderr.isatty(),
     )
     print(f"\n{loop_text(found)}\n")
     if arguments.html is not None:

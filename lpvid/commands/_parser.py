@@ -7,6 +7,7 @@ from typing import NoReturn
 
 from lpvid.commands import _values as values
 from lpvid.commands._errors import UsageError
+from lpvid.loop import HOLDS
 from lpvid.loop.structures import STRUCTURES as PORTED_STRUCTURES
 
 METHODS = ("po-moesp", "pi-moesp", "n4sid", "cva", "orse")
@@ -265,6 +266,13 @@ def _add_close_loop(commands) -> None:
         default=[],
         metavar="FILE",
         help="a held-out record; all FILEs are then fitted to",
+    )
+    close_loop.add_argument(
+        "--hold",
+        choices=HOLDS,
+        default="zero",
+        help="what the inputs do between samples: held (zero), or straight lines, for measured and "
+        "band-limited ones (zero)",
     )
     close_loop.add_argument("--json", metavar="FILE", help="where to write the figures as JSON")
     close_loop.add_argument("--html", metavar="FILE", help="where to write the report as HTML")

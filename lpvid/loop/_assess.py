@@ -75,6 +75,7 @@ def ladder(fitted: Fitted, records: Records, horizon: int) -> np.ndarray:
 
     segments = Records(
         u=picked(records.u),
+        change=picked(records.change),
         y=picked(records.y),
         history=picked(records.history),
         time=picked(records.time),
@@ -138,6 +139,8 @@ def robust_covariance(fitted: Fitted) -> np.ndarray:
     rows = np.einsum("ny,yz->nz", errors, white)
     design = np.einsum("nyc,yz->nzc", columns, white)
     gram = np.einsum("nzc,nzd->cd", design, design, optimize=True)
+    if not np.all(np.isfinite(gram)):
+        return np.full_like(gram, np.inf)
     score = np.einsum("nz,nzc->nc", rows, design)
     meat = score.T @ score
     lags = window(samples)

@@ -5,13 +5,14 @@ import numpy as np
 from lpvid.data import DataError, IOData
 from lpvid.loop._ported import AbstractPortedStructure
 from lpvid.loop._program import SLOTS
+from lpvid.loop._records import HOLDS
 
 _LEAST_SAMPLES = 100
 _LEAST_HELD_OUT = 50
 
 
 def checked_options(
-    test: IOData | None, split: float, most_effects: int, horizon: int | None
+    test: IOData | None, split: float, most_effects: int, horizon: int | None, hold: str
 ) -> None:
     """Refuse choices that leave nothing to do.
 
@@ -20,10 +21,16 @@ def checked_options(
         split: share that estimates.
         most_effects: effects to add at most.
         horizon: samples of the horizon error, if given.
+        hold: what the inputs do between samples.
 
     Raises:
-        ValueError: an unusable split, number of effects or horizon.
+        ValueError: an unusable split, number of effects or horizon, an unknown hold.
     """
+    if hold not in HOLDS:
+        raise ValueError(
+            f'hold={hold!r} is not known: "zero" for inputs that a converter holds, "linear" for '
+            "measured ones that are band-limited."
+        )
     if horizon is not None and horizon < 1:
         raise ValueError(f"horizon={horizon} must be a number of samples, 1 or more.")
     if not 1 <= most_effects <= SLOTS:

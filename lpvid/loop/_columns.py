@@ -120,6 +120,8 @@ def _varied(trace: Along, place: Place, varying: Sampled) -> Signal:
     seen, before = (np.asarray(states) for states in trace.states)
     moved = _over_nodes(weights, own.transition, seen)
     moved = moved + _over_nodes(weights, own.drive, np.asarray(trace.forces))
+    change = np.asarray(records.change)
+    moved = moved + _over_nodes(weights, own.ramp[:, :, : change.shape[1]], change)
     said = _over_nodes(weights, own.C, before)
     said = said + _over_nodes(weights, own.D, np.asarray(records.u))
     return moved * follow, said * follow

@@ -14,6 +14,7 @@ from lpvid.loop._assess import default_horizon, ladder, noise_in
 from lpvid.loop._bench import Bench
 from lpvid.loop._checks import checked_fit, checked_options, checked_records, checked_signals
 from lpvid.loop._compare import better
+from lpvid.loop._folded import folded_sensor
 from lpvid.loop._loop import Loop
 from lpvid.loop._noise_floor import measured_floor
 from lpvid.loop._ported import AbstractPortedStructure
@@ -47,6 +48,7 @@ def close_the_loop(
     laws: Sequence[AbstractLaw] = LIBRARY,
     most_effects: int = SLOTS,
     horizon: int | None = None,
+    hold: str = "zero",
     progress: bool = False,
 ) -> Loop:
     """Find what a model lacks in measured records, add it, and report the error before and after.
@@ -71,6 +73,8 @@ def close_the_loop(
         laws: the library of effects.
         most_effects: effects to add at most.
         horizon: samples of the horizon error; a twentieth of the held-out record if `None`.
+        hold: what the inputs do between samples: "zero" where a converter holds them, "linear"
+            where they were measured and are band-limited.
         progress: whether a bar shows the rounds.
 
     Returns:
@@ -99,11 +103,11 @@ def close_the_loop(
         ('named', ['coulomb'])
     """
     begun = time.perf_counter()
-    checked_options(test, split, most_effects, horizon)
+    checked_options(test, split, most_effects, horizon, hold)
     checked_signals(data, test)
     structure = _structure(model, data if test is not None else data.split(split)[0])
     checked_records(structure, data, test, split, horizon)
-    bench = _bench(structure, data, test, split, tuple(laws))
+    bench = _bench(structure, data, test, split, tuple(laws), hold)
     with tqdm(total=most_effects + 3, disable=not progress, desc="fitting") as bar:
         base = _base(bench)
         bar.update()
@@ -123,22 +127,22 @@ def _structure(model: Any, train: IOData) -> AbstractPortedStructure:
     return PortedModel(model, train)
 
 
-def _bench(structure, data, test, split, laws) -> Bench:
+def _bench(structure, data, test, split, laws, hold) -> Bench:
     if test is None:
         train, held_out = data.split(split)
         starts = [data.dt * length for length in train.lengths]
         first = train.lengths[0]
     else:
         train, held_out, starts, first = data, test, None, 0
-    setting = Setting(structure, laws, train.dt)
+    setting = Setting(structure, laws, train.dt, hold=hold)
     nodes = scheduling_nodes(data)
     duration = train.dt * (max(data.lengths) if test is None else max(train.lengths))
     length = max(train.n_samples, held_out.n_samples)
     return Bench(
         setting=setting,
         data=(train, held_out),
-        train=records_of(train, nodes, duration, None, length),
-        held_out=records_of(held_out, nodes, duration, starts, length),
+        train=records_of(train, nodes, duration, None, length, hold=hold),
+        held_out=records_of(held_out, nodes, duration, starts, length, hold=hold),
         schedules=schedule_names(data),
         duration=duration,
         first_sample=first,
@@ -168,7 +172,9 @@ def _rounds(bench: Bench, base: Fitted, most: int, bar: tqdm) -> Rounds:
         rankings.append(ranking)
         if ranking.p_value > LEVEL or (chosen and _at_floor(bench, fitted)):
             return Rounds(fitted, chosen, rankings, unfruitful)
-        found = choose(fitted, ranking, bench.train, bench.held_out)
+        found = None if chosen else folded_sensor(bench, fitted, ranking)
+        if found is None:
+            found = choose(fitted, ranking, bench.train, bench.held_out)
         slower = max((one for one in RATIOS if one <= _SLOWER * fitted.ratio), default=None)
         if found is None and slower is not None:
             bar.set_description(f"round {len(rankings)}, slow gain")

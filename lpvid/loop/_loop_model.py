@@ -10,13 +10,15 @@ from jaxtyping import ArrayLike, Float
 from lpvid._results import Status
 from lpvid.control import ClosedLoopMotion
 from lpvid.data import IOData
-from lpvid.loop._assess import free_run
+from lpvid.loop._assess import free_run, robust_covariance
+from lpvid.loop._numbers import parameter_numbers, seated_effect
 from lpvid.loop._ported import AbstractPortedStructure
 from lpvid.loop._program import Feedback, Records
 from lpvid.loop._records import records_of
+from lpvid.loop._result import EstimatedNumber, SeatedEffect
 from lpvid.loop._rounds import held_out_errors
 from lpvid.loop._search import run
-from lpvid.loop._tune import Fitted
+from lpvid.loop._tune import Fitted, refit, simulation_fit, with_starts
 from lpvid.mechanics import SampledController
 
 
@@ -27,6 +29,8 @@ class LoopModel(NamedTuple):
         fitted: everything estimated, and the predictor's gain.
         nodes: of the scheduling that the gain is known at (node, nk).
         duration: s over which what follows "time" goes from its first to its last value.
+        schedules: names of what a strength may follow.
+        covariance: of everything estimated, robust to autocorrelation.
 
     Example:
         >>> from lpvid import IOData, close_the_loop
@@ -44,6 +48,8 @@ class LoopModel(NamedTuple):
     fitted: Fitted
     nodes: np.ndarray
     duration: float
+    schedules: tuple[str, ...]
+    covariance: np.ndarray
 
     @property
     def structure(self) -> AbstractPortedStructure:
@@ -54,6 +60,19 @@ class LoopModel(NamedTuple):
     def parameters(self) -> np.ndarray:
         """ϑ (parameter,), in the order of `structure.parameter_names`."""
         return np.asarray(self.fitted.unknowns.theta)
+
+    @property
+    def estimates(self) -> tuple[EstimatedNumber, ...]:
+        """The parameters by name, with standard errors and units."""
+        return parameter_numbers(self.fitted, self.covariance)
+
+    @property
+    def effects(self) -> tuple[SeatedEffect, ...]:
+        """The effects in the model, with their numbers."""
+        return tuple(
+            seated_effect(self.fitted, self.covariance, slot, self.schedules)
+            for slot in range(len(self.fitted.places))
+        )
 
     def simulate(
         self, data: IOData, *, initial_states: Float[ArrayLike, "record state"] | None = None
@@ -97,6 +116,29 @@ class LoopModel(NamedTuple):
             ValueError: channels or sample time do not suit.
         """
         return np.asarray(data.y) - held_out_errors(self.fitted, self._records(data))
+
+    def refine(self, data: IOData, *, simulation: bool = False) -> "LoopModel":
+        """The same model, its parameters and effects fitted again to other or longer records.
+
+        A search over many laws is best made on a part of a long record; what it found is then
+        fitted to all of it. Held-out data stay held out only if they are not among the records.
+
+        Args:
+            data: records like those that the model was found on.
+            simulation: whether the error of simulation is minimised, nothing measured fed back, in
+                place of the one-step predictor's. It weighs what the model lacks by how far that
+                carries, and asks for a stable plant.
+
+        Raises:
+            ValueError: channels or sample time do not suit.
+        """
+        records, old = self._records(data), self.fitted
+        begun = old._replace(unknowns=with_starts(old, records))
+        if not simulation:
+            refined = refit(begun, records, old.ratio, old.ratios)
+        else:
+            refined = simulation_fit(begun, records)
+        return loop_model(refined, self.nodes, self.duration, self.schedules)
 
     def simulate_closed_loop(
         self,
@@ -177,16 +219,21 @@ class LoopModel(NamedTuple):
             raise ValueError(
                 f"data: {self.nodes.shape[1]} scheduling signals are needed, got {scheduling}."
             )
-        return records_of(data, self.nodes, self.duration)
+        hold = self.fitted.setting.hold
+        return records_of(data, self.nodes, self.duration, hold=hold)
 
 
-def loop_model(fitted: Fitted, nodes: np.ndarray, duration: float) -> LoopModel:
-    """The model without the derivatives that only its search needed.
+def loop_model(
+    fitted: Fitted, nodes: np.ndarray, duration: float, schedules: tuple[str, ...]
+) -> LoopModel:
+    """The model without the derivatives that only its search and covariance needed.
 
     Args:
         fitted: the model.
         nodes: of the scheduling.
         duration: s of the schedule "time".
+        schedules: names of what a strength may follow.
     """
+    covariance = robust_covariance(fitted)
     searched = fitted.searched._replace(columns=np.zeros((0, 0, 0)))
-    return LoopModel(fitted._replace(searched=searched), nodes, duration)
+    return LoopModel(fitted._replace(searched=searched), nodes, duration, schedules, covariance)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from lpvid.effects import HISTORY, MEMORY, AbstractLaw, Signals
+from lpvid.effects import HISTORY, MEMORY, AbsoluteValueSensor, AbstractLaw, Signals
 from lpvid.loop._discretise import Sampled, sampled_at
 from lpvid.loop._path import moments, path_of, path_rule
 from lpvid.loop._ported import AbstractPortedStructure
@@ -33,12 +33,14 @@ class Setting(eqx.Module):
         laws: the library.
         dt: sample time, s.
         varying: whether an effect of the program may let a parameter vary.
+        hold: what the inputs do between samples, "zero" or "linear".
     """
 
     structure: AbstractPortedStructure
     laws: tuple[AbstractLaw, ...] = eqx.field(static=True)
     dt: float = eqx.field(static=True)
     varying: bool = eqx.field(static=True, default=False)
+    hold: str = eqx.field(static=True, default="zero")
 
 
 class Records(eqx.Module):
@@ -46,6 +48,7 @@ class Records(eqx.Module):
 
     Attributes:
         u: (time, nu).
+        change: how far the inputs move until the next sample, zero where held (time, nu).
         y: (time, ny).
         history: of the inputs, the present sample first (time, lag, nu).
         time: s since the record's start (time,).
@@ -59,6 +62,7 @@ class Records(eqx.Module):
     """
 
     u: Float[Array, "time nu"]
+    change: Float[Array, "time nu"]
     y: Float[Array, "time ny"]
     history: Float[Array, "time lag nu"]
     time: Float[Array, " time"]
@@ -289,6 +293,14 @@ def trace(
             total = one(slot, evaluate, total)
         return total
 
+    def turned(ideal):
+        """The slope of sensors that fold their output, ±1: it turns the correction round."""
+        slope = jnp.ones(ny)
+        for slot, law in enumerate(slots.laws):
+            if isinstance(setting.laws[law], AbsoluteValueSensor):
+                slope = jnp.where((slots.output[slot] > 0.0) & (ideal < 0.0), -1.0, slope)
+        return slope
+
     def command(M: Sampled, x, memory, drive, clock, sees, sample, commanded):
         """Inputs as a controller wants them, which sees the outputs that the last ones leave."""
         assert feedback is not None
@@ -303,7 +315,7 @@ def trace(
 
     def step(carry, fraction):
         x, memory, drive, commanded = carry
-        u, y, history, share, time, since, weight, kappa_weight, *marks, added = fraction
+        u, slope, y, history, share, time, since, weight, kappa_weight, *marks, added = fraction
         first, which, which_sample, sees, ends = marks
         M = _at(matrices, weight)
         L = jnp.tensordot(kappa_weight, gain, axes=1)
@@ -314,15 +326,15 @@ def trace(
             u, history, commanded = command(
                 M, x, memory, drive, (time, since, share), sees > 0.0, which_sample, commanded
             )
-        held = jnp.concatenate([u, idle[nu:]])
+        given, rise = (jnp.concatenate([part, idle[nu:]]) for part in (u, slope))
         # Laws are read on the way that the model takes by itself, with the last forces.
-        free = M.transition @ x + M.drive @ held
+        free = M.transition @ x + M.drive @ given + M.ramp @ rise
         along, sensed, following = contributions(
             M, x, free + M.drive @ drive, memory, u, history, time, since, share
         )
         level, change = moments(along)
         error = sees * (y - (M.C @ x + M.D @ (u + level[:nu]) + sensed + added.output))
-        correction = L @ error
+        correction = L @ (turned(M.C @ x + M.D @ u) * error)
         moved = free + M.drive @ level + M.ramp @ change + M.transition @ correction
         # Added at the end, so that a sensitivity sees it as one more force over the sample.
         moved = moved + ends * added.state
@@ -336,8 +348,11 @@ def trace(
     follow = records.schedules @ slots.schedule.T
     shares = 1.0 + slots.modulated[None] * (follow - 1.0)
     place = jnp.tile(jnp.arange(float(substeps)), records.u.shape[0])
+    slope = spread(records.change) / substeps
     fractions = (
-        *map(spread, (records.u, records.y, records.history, shares)),
+        spread(records.u) + place[:, None] * slope,
+        slope,
+        *map(spread, (records.y, records.history, shares)),
         spread(records.time) + fine * place,
         fine * place,
         *map(spread, (node_weights, records.weights)),
@@ -378,16 +393,3 @@ def nothing_injected(records: Records, states: int) -> Injection:
         states: of the model.
     """
     return Injection(jnp.zeros((records.u.shape[0], states)), jnp.zeros_like(records.y))
-
-
-def history_of(u: Float[Array, "time nu"], first: Float[Array, " time"]) -> Float[Array, "..."]:
-    """The inputs' last samples, the present one first, the first sample held before a start.
-
-    Args:
-        u: (time, nu), several records one after another.
-        first: whether a sample starts its record (time,).
-    """
-    place = jnp.arange(u.shape[0])
-    begin = lax.cummax(jnp.where(first > 0.0, place, 0))
-    lags = jnp.arange(HISTORY)
-    return u[jnp.maximum(place[:, None] - lags[None, :], begin[:, None])]

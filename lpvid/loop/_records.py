@@ -4,10 +4,15 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
 
 from lpvid.data import IOData
-from lpvid.effects import MEMORY
-from lpvid.loop._program import SLOTS, Records, history_of
+from lpvid.effects import HISTORY, MEMORY
+from lpvid.loop._program import SLOTS, Records
+
+HOLDS = ("zero", "linear")
+"""What inputs may do between samples: stay, or run straight to the next one."""
 
 _NODES = 7
 """Scheduling nodes of a varying model: Chebyshev's, through which the matrices' polynomial goes."""
@@ -74,6 +79,8 @@ def records_of(
     duration: float,
     start_times: Sequence[float] | None = None,
     length: int | None = None,
+    *,
+    hold: str = "zero",
 ) -> Records:
     """Records for the predictor.
 
@@ -83,6 +90,7 @@ def records_of(
         duration: s that the schedule "time" goes from −1 to 1 in.
         start_times: s at which each record starts; zero if `None`.
         length: samples to pad to, so that several records share one compiled program.
+        hold: what the inputs do between samples, "zero" or "linear".
     """
     u, y = np.asarray(data.u), np.asarray(data.y)
     lengths = np.asarray(data.lengths)
@@ -99,6 +107,10 @@ def records_of(
         middle, half = _range(nodes) if len(nodes) > 1 else (float(nodes[0, 0]), 1e-12)
         follow = np.concatenate([(kappa - middle) / max(half, 1e-12), follow], axis=1)
     counts = np.ones(u.shape[0])
+    change = np.zeros_like(u)
+    if hold == "linear":
+        # A record's last sample has no next one, and is held.
+        change[:-1] = np.where(first[1:, None] > 0.0, 0.0, np.diff(u, axis=0))
     spare = 0 if length is None else length - u.shape[0]
 
     def padded(array):
@@ -108,10 +120,12 @@ def records_of(
     u, y, time, weights, follow, record = map(padded, (u, y, time, weights, follow, record))
     first = np.concatenate([first, np.zeros(spare)])
     counts = np.concatenate([counts, np.zeros(spare)])
+    change = np.concatenate([change, np.zeros((spare, change.shape[1]))])
     return Records(
         u=jnp.asarray(u),
+        change=jnp.asarray(change),
         y=jnp.asarray(y),
-        history=history_of(jnp.asarray(u), jnp.asarray(first)),
+        history=_history(jnp.asarray(u), jnp.asarray(first)),
         time=jnp.asarray(time),
         kappa_nodes=jnp.asarray(nodes),
         weights=jnp.asarray(weights),
@@ -121,3 +135,11 @@ def records_of(
         counts=jnp.asarray(counts),
         memory=jnp.zeros((lengths.size, SLOTS, MEMORY)),
     )
+
+
+def _history(u: Float[Array, "time nu"], first: Float[Array, " time"]) -> Float[Array, "..."]:
+    """The inputs' last samples, the present one first, the first sample held before a start."""
+    place = jnp.arange(u.shape[0])
+    begin = lax.cummax(jnp.where(first > 0.0, place, 0))
+    lags = jnp.arange(HISTORY)
+    return u[jnp.maximum(place[:, None] - lags[None, :], begin[:, None])]

@@ -42,8 +42,15 @@ class Ranked(NamedTuple):
     penalised: float
 
 
-def _seated(unknowns: Unknowns, slot: int, entry: Ranked, whole: bool) -> Unknowns:
-    """The unknowns with a candidate in a slot."""
+def seated(unknowns: Unknowns, slot: int, entry: Ranked, whole: bool) -> Unknowns:
+    """The unknowns with a candidate in a slot.
+
+    Args:
+        unknowns: the model's.
+        slot: of the effect.
+        entry: the candidate.
+        whole: whether it replaces a signal, with an amplitude of one.
+    """
     amplitude, shape = np.array(unknowns.amplitude), np.array(unknowns.shape)
     amplitude[slot], shape[slot] = 0.0, 0.0
     if whole:
@@ -69,7 +76,7 @@ def with_effect(fitted: Fitted, records: Records, entry: Ranked) -> Fitted:
         entry: the candidate.
     """
     law, place = fitted.setting.laws[entry.trial.place.law], entry.trial.place
-    unknowns = _seated(fitted.unknowns, len(fitted.places), entry, law.whole)
+    unknowns = seated(fitted.unknowns, len(fitted.places), entry, law.whole)
     if law.whole and law.shapes:
         unknowns = _best_start(fitted, records, entry, unknowns)
     model = _refitted(fitted, records, place, unknowns)

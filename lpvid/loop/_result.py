@@ -24,6 +24,22 @@ class EstimatedNumber(NamedTuple):
     unit: str
 
 
+class SeatedEffect(NamedTuple):
+    """An effect in a model, with its numbers.
+
+    Attributes:
+        name: of its law.
+        family: of its law.
+        port: where it acts, such as "force at load" or "input torque".
+        parameters: amplitudes, then shapes.
+    """
+
+    name: str
+    family: str
+    port: str
+    parameters: tuple[EstimatedNumber, ...]
+
+
 class FoundEffect(NamedTuple):
     """An effect that the records name.
 

@@ -33,7 +33,9 @@ class Scored(NamedTuple):
 
 
 def _least_squares(gram: np.ndarray, product: np.ndarray) -> np.ndarray:
-    """Minimal solution of gram x = product, both scaled to a unit diagonal first."""
+    """Minimal solution of gram x = product, both scaled to a unit diagonal first; 0 on overflow."""
+    if not np.all(np.isfinite(gram)):
+        return np.zeros_like(product)
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = np.linalg.eigh(gram / scale[:, None] / scale[None, :])
     inverse = np.where(

@@ -267,9 +267,11 @@ def search(
         white = whitener(errors)
         rows = np.einsum("ny,yz->nz", errors, white).reshape(-1)
         design = np.einsum("nyc,yz->nzc", columns, white).reshape(rows.size, -1)
-        if not np.all(np.isfinite(design)):
+        with np.errstate(all="ignore"):
+            gram, slope = design.T @ design, design.T @ rows
+        # Sensitivities that run away may overflow in their products only.
+        if not (np.all(np.isfinite(gram)) and np.all(np.isfinite(slope))):
             break
-        gram, slope = design.T @ design, design.T @ rows
         point = best[places]
         # What sits at a bound and would leave it does not take part in this step.
         free = ~(((point <= lower) & (slope > 0.0)) | ((point >= upper) & (slope < 0.0)))

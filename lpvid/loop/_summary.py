@@ -4,29 +4,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from lpvid.analysis import residual_tests
-from lpvid.effects import Units, fill
-from lpvid.loop._assess import (
-    default_horizon,
-    errors_of,
-    ladder,
-    robust_covariance,
-    standard_errors,
-)
+from lpvid.loop._assess import default_horizon, errors_of, ladder
 from lpvid.loop._bench import Bench
 from lpvid.loop._candidates import Place, port_name
 from lpvid.loop._loop import Loop
-from lpvid.loop._loop_model import loop_model
+from lpvid.loop._loop_model import LoopModel, loop_model
 from lpvid.loop._refit import without
 from lpvid.loop._result import (
     Candidate,
-    EstimatedNumber,
     FoundEffect,
     Ladder,
     Series,
 )
 from lpvid.loop._rounds import Chosen, Ranking, Rounds, held_out_errors
 from lpvid.loop._score import family_wise
-from lpvid.loop._tune import Fitted, free_unknowns
+from lpvid.loop._tune import Fitted
 from lpvid.loop._verdict import Evidence, decide, explained
 from lpvid.loop._virtual_force import virtual_forces
 
@@ -78,7 +70,6 @@ def summarise(
         fitted, chosen = base, []
         after, ladder_after, run_after = before, ladder_before, run_before
         errors["after"] = errors["before"]
-    covariance = robust_covariance(fitted)
     ablation = {}
     for slot, one in enumerate(chosen):
         name = _label(bench, one.entry.trial.place)
@@ -87,16 +78,18 @@ def summarise(
             reduced = without(fitted, bench.train, slot)
             steps = ladder(reduced, bench.held_out, horizon)
             ablation[name] = np.sqrt(np.mean(steps**2, axis=0))
-    structure = bench.setting.structure
     nodes = np.asarray(bench.train.kappa_nodes)
+    # One is the other where nothing was added: its covariance is worked out once.
+    model_before = loop_model(base, nodes, bench.duration, bench.schedules)
+    model = model_before
+    if fitted is not base:
+        model = loop_model(fitted, nodes, bench.duration, bench.schedules)
     return Loop(
         verdict=verdict,
         advice=advice,
-        structure=str(structure.name),
-        parameters=_parameters(bench, fitted, covariance),
-        effects=tuple(
-            _effect(bench, fitted, covariance, slot, one) for slot, one in enumerate(chosen)
-        ),
+        structure=str(bench.setting.structure.name),
+        parameters=model.estimates,
+        effects=tuple(_effect(model, bench, slot, one) for slot, one in enumerate(chosen)),
         before=before,
         after=after,
         noise_floor=floor,
@@ -123,8 +116,8 @@ def summarise(
             errors["before"],
             errors["after"],
         ),
-        model=loop_model(fitted, nodes, bench.duration),
-        model_before=loop_model(base, nodes, bench.duration),
+        model=model,
+        model_before=model_before,
         output_names=held_out.output_names,
         output_units=held_out.output_units,
         dt=held_out.dt,
@@ -157,78 +150,16 @@ def _ranked(bench: Bench, ranking: Ranking) -> tuple[Candidate, ...]:
     )
 
 
-def _parameters(
-    bench: Bench, fitted: Fitted, covariance: np.ndarray
-) -> tuple[EstimatedNumber, ...]:
-    structure, theta = bench.setting.structure, np.asarray(fitted.unknowns.theta)
-    spread = standard_errors(covariance)[: theta.size]
-    rows = zip(structure.parameter_names, theta, spread, structure.parameter_units, strict=True)
-    return tuple(
-        EstimatedNumber(name, float(value), float(std), unit) for name, value, std, unit in rows
-    )
-
-
-def _units(bench: Bench, place: Place) -> Units:
-    structure = bench.setting.structure
-    if place.port == "force":
-        return Units(structure.force_units[place.where], structure.coordinate_units[place.where])
-    if place.port == "input":
-        return Units(structure.input_units[place.where])
-    if place.port == "output":
-        return Units(structure.output_units[place.where])
-    return Units("")
-
-
-def _effect(
-    bench: Bench, fitted: Fitted, covariance: np.ndarray, slot: int, found: Chosen
-) -> FoundEffect:
-    place = found.entry.trial.place
-    law, units = bench.setting.laws[place.law], _units(bench, place)
-    where, _, _ = free_unknowns(bench.setting, fitted.places, fitted.scales, fitted.unknowns)
-    spread = np.full(int(where.max()) + 1, np.nan)
-    spread[where] = standard_errors(covariance)
-    directions = fitted.unknowns.amplitude.shape[2]
-    along = directions if place.port == "force" else 1
-    amplitudes, shapes = fitted.unknowns.amplitude[slot], fitted.unknowns.shape[slot]
-    start = fitted.unknowns.theta.size + slot * fitted.unknowns.amplitude[0].size
-    numbers = []
-    if not law.whole:
-        for number, amplitude in enumerate(law.amplitudes):
-            for direction in range(along):
-                suffix = f"[{direction + 1}]" if along > 1 else ""
-                numbers.append(
-                    EstimatedNumber(
-                        amplitude.name + suffix,
-                        float(amplitudes[number, direction]),
-                        float(spread[start + number * directions + direction]),
-                        fill(amplitude.unit, units),
-                    )
-                )
-    start = (
-        fitted.unknowns.theta.size
-        + fitted.unknowns.amplitude.size
-        + slot * fitted.unknowns.shape.shape[1]
-    )
-    for number, shape in enumerate(law.shapes):
-        numbers.append(
-            EstimatedNumber(
-                shape.name,
-                float(shapes[number]),
-                float(spread[start + number]),
-                fill(shape.unit, units),
-            )
-        )
+def _effect(model: LoopModel, bench: Bench, slot: int, found: Chosen) -> FoundEffect:
+    seated = model.effects[slot]
     confusable = tuple(_label(bench, other) for other in found.confusable)
     return FoundEffect(
-        name=law.name,
-        family=law.family,
-        port=port_name(bench.setting.structure, place, bench.schedules),
-        parameters=tuple(numbers),
+        *seated,
         confusable_with=confusable,
         gain=found.entry.scored.gain,
         held_out_gain=found.held_out_gain,
         p_value=found.p_value,
-        separating_input=_SEPARATING[place.port] if confusable else "",
+        separating_input=_SEPARATING[found.entry.trial.place.port] if confusable else "",
     )
 
 

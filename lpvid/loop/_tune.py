@@ -1,5 +1,6 @@
 """Fitting a model with its effects: innovations by least squares, diffusion by likelihood."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lpvid.effects import Scales
+from lpvid.effects import AbsoluteValueSensor, Scales
 from lpvid.loop._candidates import Place, slots_of
 from lpvid.loop._gain import gains
 from lpvid.loop._path import AMPLITUDES
@@ -140,7 +141,7 @@ def varying(setting: Setting, places: Sequence[Place]) -> Setting:
         places: of the effects.
     """
     wanted = any(place.port == "parameter" for place in places)
-    return Setting(setting.structure, setting.laws, setting.dt, wanted)
+    return dataclasses.replace(setting, varying=wanted)
 
 
 def fit(
@@ -241,6 +242,22 @@ def refit(fitted: Fitted, records: Records, ratio: float, ratios: tuple[float, .
     )
 
 
+def simulation_fit(fitted: Fitted, records: Records) -> Fitted:
+    """The same model fitted again by its error in simulation; the gain is worked out anew after.
+
+    Args:
+        fitted: the model, with initial states of the records.
+        records: estimation data.
+    """
+    setting, places, scales, slots, unknowns = fitted[:5]
+    where, lower, upper = free_unknowns(setting, places, scales, unknowns)
+    none = jnp.zeros_like(fitted.gain)
+    found = search(setting, records, slots, unknowns, none, where, lower, upper)
+    theta, noise = found.unknowns.theta, jnp.asarray(fitted.noise)
+    gain = _gains(setting, records, theta, noise, jnp.asarray(float(fitted.ratio)))
+    return fitted._replace(unknowns=found.unknowns, gain=gain, searched=found)
+
+
 def with_starts(fitted: Fitted, records: Records, gain: Array | None = None) -> Unknowns:
     """The fitted unknowns with initial states fitted to other records.
 
@@ -249,10 +266,23 @@ def with_starts(fitted: Fitted, records: Records, gain: Array | None = None) -> 
         records: as many as it was fitted to.
         gain: L; the model's own if `None`.
     """
-    unknowns = eqx.tree_at(lambda tree: tree.start, fitted.unknowns, _rough_starts(fitted, records))
+    first, *others = [
+        _started(fitted, records, starts, gain) for starts in _rough_starts(fitted, records)
+    ]
+    # Each record starts by the sign that suits it.
+    starts, sizes = np.array(first.unknowns.start), _sizes(first, records)
+    for other in others:
+        better = _sizes(other, records) < sizes
+        starts[better] = np.asarray(other.unknowns.start)[better]
+        sizes = np.minimum(sizes, _sizes(other, records))
+    return eqx.tree_at(lambda tree: tree.start, first.unknowns, jnp.asarray(starts))
+
+
+def _started(fitted: Fitted, records: Records, starts: Array, gain: Array | None) -> Searched:
+    unknowns = eqx.tree_at(lambda tree: tree.start, fitted.unknowns, starts)
     places = start_places(unknowns)
     free = np.full(places.size, np.inf)
-    found = search(
+    return search(
         fitted.setting,
         records,
         fitted.slots,
@@ -264,11 +294,26 @@ def with_starts(fitted: Fitted, records: Records, gain: Array | None = None) -> 
         steps=5,
         tolerance=0.1,
     )
-    return found.unknowns
 
 
-def _rough_starts(fitted: Fitted, records: Records) -> Array:
-    """Initial states (record, state): the outputs as measured, the rest at rest."""
+def _sizes(found: Searched, records: Records) -> np.ndarray:
+    """Sum of the squared errors of each record, infinite where they are not finite."""
+    record = np.asarray(records.record)[: found.errors.shape[0]]
+    squares = np.sum((found.errors / np.std(np.asarray(records.y), axis=0)) ** 2, axis=1)
+    sizes = np.bincount(record, squares, minlength=records.memory.shape[0])
+    return np.where(np.isfinite(sizes), sizes, np.inf)
+
+
+def _rough_starts(fitted: Fitted, records: Records) -> list[Array]:
+    """Initial states (record, state): the outputs as measured, the rest at rest.
+
+    One for each sign that an output whose sensor folds it may have.
+    """
     C = fitted.setting.structure.ports(fitted.unknowns.theta, records.kappa_nodes[0]).C
     first = np.asarray(records.y)[np.asarray(records.first) > 0.0]
-    return jnp.asarray(first @ np.linalg.pinv(np.asarray(C)).T)
+    signs = [np.ones(first.shape[1])]
+    for place in fitted.places:
+        if isinstance(fitted.setting.laws[place.law], AbsoluteValueSensor):
+            turned = np.where(np.arange(first.shape[1]) == place.where, -1.0, 1.0)
+            signs += [one * turned for one in signs]
+    return [jnp.asarray((first * one) @ np.linalg.pinv(np.asarray(C)).T) for one in signs]

@@ -69,12 +69,18 @@ def test_verdict_effects_and_errors_are_said_and_written(capsys, tmp_path, table
     assert (base, order) == ("servo", None)
     # The structure is started from what is fitted to, and from nothing else.
     assert fitted.n_samples == pytest.approx(2 / 3 * engine.data.n_samples, abs=1)
-    assert engine.options == {"test": None, "split": pytest.approx(2 / 3), "progress": False}
+    assert engine.options == {
+        "test": None,
+        "split": pytest.approx(2 / 3),
+        "hold": "zero",
+        "progress": False,
+    }
 
 
 def test_files_are_experiments_and_a_test_file_is_held_out(capsys, tables, engine):
     argv = [tables["0.0"], tables["0.5"], *COLUMNS, "--schedule", "k", "--order", "3"]
-    assert main(["close-loop", *argv, "--test", tables["1.0"]]) == 0
+    assert main(["close-loop", *argv, "--test", tables["1.0"], "--hold", "linear"]) == 0
+    assert engine.options["hold"] == "linear"
     assert engine.data.lengths == (800, 800)
     assert engine.data.scheduling_names == ("k",)
     test = engine.options["test"]

@@ -37,6 +37,7 @@ SERVO = structure_named("servo", DATA)
         (DATA.replace(u=np.ones(SAMPLES)), {}, "input 'u1' is constant.*or excite it"),
         (DATA.replace(y=np.zeros(SAMPLES)), {}, "output 'y1' is constant"),
         (DATA, {"most_effects": 4}, "most_effects=4 must be 1 to 3"),
+        (DATA, {"hold": "cubic"}, "hold='cubic' is not known"),
         (_data(kappa=RNG.uniform(size=(SAMPLES, 2))), {}, "2 scheduling signals"),
     ],
 )

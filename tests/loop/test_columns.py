@@ -22,8 +22,8 @@ FRICTION = Place(0, "force", 0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("parameter", [0, 1])
-def test_a_drifting_parameter_beside_friction(parameter):
+@pytest.mark.parametrize(("parameter", "hold"), [(0, "zero"), (1, "linear")])
+def test_a_drifting_parameter_beside_friction(parameter, hold):
     rng = np.random.default_rng(0)
     count, dt = 300, 0.05
     u = np.repeat(rng.standard_normal(count // 15), 15)
@@ -35,7 +35,7 @@ def test_a_drifting_parameter_beside_friction(parameter):
             position += dt / 100 * speed
     data = IOData(u=u, y=np.array(y), dt=dt)
     structure = Servo(data)
-    records = records_of(data, np.zeros((1, 0)), count * dt)
+    records = records_of(data, np.zeros((1, 0)), count * dt, hold=hold)
     setting = Setting(structure, LAWS, dt, True)
     unknowns = empty_unknowns(np.ones(2), 2, 1, 1)
     unknowns = eqx.tree_at(

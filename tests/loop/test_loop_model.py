@@ -35,6 +35,23 @@ def test_several_records_are_simulated_one_after_the_other(loop):
         np.testing.assert_allclose(part, alone, rtol=0.0, atol=1e-9)
 
 
+def test_what_was_found_is_fitted_to_longer_records(loop):
+    longer = record(coulomb(0.4), samples=900, seed=33)
+    other = record(coulomb(0.4), seed=34)
+    simulated = loop.model.refine(longer, simulation=True)
+    errors = [np.std(np.asarray(other.y) - one.simulate(other)) for one in (simulated, loop.model)]
+    assert errors[0] < 1.2 * NOISE
+    # On its own records nothing with these parameters simulates better.
+    own = [np.std(np.asarray(longer.y) - one.simulate(longer)) for one in (simulated, loop.model)]
+    assert own[0] <= own[1]
+    (effect,) = simulated.effects
+    level = effect.parameters[0]
+    assert (effect.name, effect.port, level.name) == ("coulomb", "force at place", "Fc")
+    assert abs(level.value - 0.4) < 5.0 * level.std < 0.05
+    assert simulated.parameters.tolist() == [number.value for number in simulated.estimates]
+    assert loop.model.effects[0].parameters == loop.effects[0].parameters
+
+
 def test_held_out_parts_of_several_records_keep_their_own_clock():
     lengths = (400, 700)
     data = join([record(samples=n, seed=n) for n in lengths])

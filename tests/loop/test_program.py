@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.signal
 from jax.flatten_util import ravel_pytree
 
 from lpvid.data import IOData
@@ -38,10 +39,10 @@ def _data(samples, dt=DT, hold=4):
     return IOData(u=u, y=0.1 * rng.standard_normal((samples, 2)), dt=dt)
 
 
-def _model(data, places):
+def _model(data, places, hold="zero"):
     structure = structure_named("mass-spring-damper", data)
     setting = Setting(structure, LAWS, data.dt)
-    records = records_of(data, np.zeros((1, 0)), data.dt * data.n_samples)
+    records = records_of(data, np.zeros((1, 0)), data.dt * data.n_samples, hold=hold)
     slots = slots_of(structure, places, 1)
     unknowns = empty_unknowns(THETA, 4, 1, 1)
     unknowns = eqx.tree_at(lambda v: v.start, unknowns, jnp.array([[0.05, -0.02, 0.1, 0.0]]))
@@ -54,9 +55,9 @@ def _model(data, places):
     return setting, records, slots, unknowns
 
 
-def _outputs(data, places):
+def _outputs(data, places, hold="zero"):
     """Simulated outputs: a gain of zero."""
-    model = _model(data, places)
+    model = _model(data, places, hold)
     out = run(*model, jnp.zeros((1, 4, 2)))
     return np.asarray(data.y) - np.asarray(out.innovations)
 
@@ -88,6 +89,24 @@ def test_a_linear_model_is_simulated_exactly():
     model = StateSpace(ports.A, ports.B, ports.C, ports.D)
     expected = np.asarray(model.simulate(u=data.u, dt=DT, x0=unknowns.start[0]))
     np.testing.assert_allclose(_outputs(data, ()), expected, rtol=1e-9, atol=1e-11)
+
+
+def test_inputs_that_run_straight_between_samples_beside_scipy():
+    data = _data(160, hold=1)
+    setting, _, _, unknowns = _model(data, ())
+    ports = setting.structure.ports(unknowns.theta, jnp.zeros(0))
+    system = (ports.A, ports.B, ports.C, ports.D)
+    times = DT * np.arange(160)
+    start = np.asarray(unknowns.start[0])
+    _, expected, _ = scipy.signal.lsim(system, np.asarray(data.u), times, X0=start)
+    found = _outputs(data, (), "linear")
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-11)
+    # In several steps a sample, with effects of no strength, it is the same path.
+    setting, records, slots, unknowns = _model(data, PLACES, "linear")
+    none = eqx.tree_at(lambda v: v.amplitude, unknowns, jnp.zeros_like(unknowns.amplitude))
+    out = run(setting, records, slots, none, jnp.zeros((1, 4, 2)))
+    np.testing.assert_allclose(records.y - out.innovations, expected, rtol=1e-9, atol=1e-11)
+    assert np.std(found - _outputs(data, ())) > 0.1 * np.std(expected)
 
 
 def test_effects_beside_scipy_and_of_second_order(truth):

@@ -15,3 +15,4 @@ from lpvid.loop.structures._named import structure_named as structure_named
 from lpvid.loop.structures._servo import Servo as Servo
 from lpvid.loop.structures._single_link_arm import FlexibleLink as FlexibleLink
 from lpvid.loop.structures._two_link_arm import PortedTwoLinkArm as PortedTwoLinkArm
+from lpvid.loop.structures._unfold import unfolded as unfolded

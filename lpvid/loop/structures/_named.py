@@ -10,6 +10,7 @@ from lpvid.loop.structures._mass_spring_damper import PortedMassSpringDamper
 from lpvid.loop.structures._servo import Servo
 from lpvid.loop.structures._single_link_arm import FlexibleLink
 from lpvid.loop.structures._two_link_arm import PortedTwoLinkArm
+from lpvid.loop.structures._unfold import unfolded
 
 _STRUCTURES: dict[str, Any] = {
     "black-box": BlackBox,
@@ -38,7 +39,8 @@ def structure_named(
 
     Args:
         name: one of `STRUCTURES`.
-        data: records, of which a black box is identified, and which give signs, names and units.
+        data: records, of which a black box is identified, and which give signs, names and units; an
+            output whose sensor folds it, y = |z|, is straightened for that.
         order: states of a black box, or of the single-link arm (4, 6 or 8); by default as many as
             the prediction error asks for.
         options: of the structure, such as `output="velocity"` of a servo.
@@ -74,4 +76,5 @@ def structure_named(
                 f"order={order}: structure {name!r} has an order of its own; leave it out, or take "
                 f"'black-box'."
             )
-    return _STRUCTURES[name](data, **options)
+    # A linear model of a folded output is none of the plant.
+    return _STRUCTURES[name](unfolded(data)[0], **options)
