@@ -57,8 +57,9 @@ class Run(NamedTuple):
         count = len(self.records)
         if self.offset.shape not in ((ny,), (count, ny)):
             raise ValueError(
-                f"output_offset has shape {self.offset.shape}; give ({ny},), or ({count}, {ny}) "
-                "for an offset of each record."
+                f"output_offset, given or the fit's own, has shape {self.offset.shape} and there "
+                f"are {count} records: give ({ny},), or ({count}, {ny}) for an offset of each "
+                "record, and lengths= for several records."
             )
         rows = jnp.broadcast_to(self.offset, (count, ny))
         return rows[np.repeat(np.arange(count), self.records)]

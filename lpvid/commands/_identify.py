@@ -52,8 +52,8 @@ def run(arguments: argparse.Namespace, warnings: Warnings) -> None:
         predictor = Innovation() if arguments.predictor == "innovation" else OutputError()
         # Means are not offsets: what they leave differs from record to record, and a
         # continuous-time method leaves it alone.
-        free = None if offset is None else "per record"
-        refined = refine(fit, train, predictor=predictor, output_offset=free)
+        rests = None if offset is None else "per record"
+        refined = refine(fit, train, predictor=predictor, output_offset=rests)
         fits["refined"] = refined
     scores = {name: _scores(found, train, test) for name, found in fits.items()}
     final = fits["refined" if arguments.refine else "identified"]
@@ -131,7 +131,11 @@ def poles_of(model: StateSpace, refined: Refined | None = None) -> list[dict[str
             own, poles, np.asarray(modes.frequency), np.asarray(modes.damping), strict=True
         )
     ]
-    if refined is None or bool(jnp.any(refined.stats["unidentified"])):
+    if refined is None:
+        return found
+    # Poles do not depend on offsets, which an integrator may hide.
+    unknown = zip(refined.parameter_names, refined.stats["unidentified"], strict=True)
+    if any(lost for name, lost in unknown if not name.startswith("offset[")):
         return found
     spread = pole_covariance(refined.model_at, refined.parameters, refined.robust_covariance)
     for pole in found:

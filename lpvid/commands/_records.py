@@ -84,7 +84,7 @@ def without_offsets(
 
 
 def offsets_of(offset: Offset | None) -> dict[str, Any] | None:
-    """The means that were taken out, one row a record, as the JSON files hold them."""
+    """The offsets, one row a record, as the JSON files hold them: means, and what a fit added."""
     return None if offset is None else {"u": offset.u, "y": offset.y}
 
 

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from lpvid.control._anti_windup import check_limit, limited, optional_floats
 from lpvid.control._closed_loop import Numbers, check_no_feedthrough
 from lpvid.control._riccati import kalman, lqr
 from lpvid.mechanics import SampledController
@@ -17,8 +18,8 @@ def _floats(value: Numbers) -> Array:
 class ILQR(SampledController):
     """u = K_P R + K_I Δt Σ_{j≤k} (R − y1(j)) − K_C x̂, x̂⁺ = A x̂ + B u + L (y1 − C1 x̂).
 
-    Only the first output is read. The observer knows the command, not what saturation or delay
-    make of it.
+    Only the first output is read. The observer knows the command within `limit`, not what another
+    saturation or a delay make of it.
 
     Attributes:
         model: discrete-time, from the command to y1 alone.
@@ -26,6 +27,8 @@ class ILQR(SampledController):
         observer: L (nx,).
         feedforward: K_P.
         integral: K_I, V/(V·s).
+        limit: of the command, V: it is cut to ±limit, and the error is not summed while the cut
+            command would be pushed further beyond it (clamping). None for neither.
 
     Source: 002, section 4.4 and figure 4-13.
 
@@ -41,8 +44,10 @@ class ILQR(SampledController):
     observer: Float[Array, "*batch nx"] = eqx.field(converter=_floats)
     feedforward: Float[Array, "*batch"] = eqx.field(converter=_floats)
     integral: Float[Array, "*batch"] = eqx.field(converter=_floats)
+    limit: Float[Array, "*batch"] | None = eqx.field(converter=optional_floats, default=None)
 
     def __check_init__(self):
+        check_limit(self.limit)
         if not self.model.is_discrete or (self.model.nu, self.model.ny) != (1, 1):
             raise ValueError(
                 f"model is {self.model!r}: a discrete-time one from the command to the first "
@@ -61,8 +66,9 @@ class ILQR(SampledController):
     ) -> tuple[tuple[Float[Array, " nx"], Float[Array, "1"]], Float[Array, "1"]]:
         """Next observed states, and the command."""
         x, total = state
-        total = total + self.model.dt * (reference - y[:1])
-        command = self.feedforward * reference + self.integral * total - self.feedback @ x
+        fed = self.feedforward * reference - self.feedback @ x
+        change = self.model.dt * (reference - y[:1])
+        total, command = limited(lambda t: fed + self.integral * t, total, change, self.limit)
         surprise = y[:1] - self.model.C @ x
         x = self.model.A @ x + self.model.B @ command + self.observer * surprise
         return (x, total), command
@@ -76,6 +82,7 @@ def design_ilqr(
     state_noise: Numbers,
     output_noise: Numbers,
     integral: Numbers = 0.0,
+    limit: Numbers | None = None,
 ) -> ILQR:
     """ILQR from weights: K_C by `lqr`, L by `kalman` from the first output alone.
 
@@ -89,12 +96,14 @@ def design_ilqr(
         state_noise: Q of the observer (nx, nx), or its diagonal.
         output_noise: R of the observer, of the first output.
         integral: K_I, V/(V·s).
+        limit: of the command, V, with clamping of the integral; none by default.
 
     Returns:
         `ILQR`.
 
     Raises:
-        ValueError: a continuous-time model, several inputs, a feedthrough, weights as for `lqr`.
+        ValueError: a continuous-time model, several inputs, a feedthrough, weights as for `lqr`, a
+            limit that is not positive.
 
     Source: 002, section 4.4.
 
@@ -117,4 +126,6 @@ def design_ilqr(
     closed = StateSpace(first.A - first.B @ K, first.B, first.C, dt=model.dt)
     follows = closed.dc_gain()[..., 0, 0]
     batch = jnp.broadcast_to(jnp.asarray(integral, float), follows.shape)
-    return ILQR(first, K[..., 0, :], L[..., 0], 1.0 / follows, batch)
+    if limit is not None:
+        limit = jnp.broadcast_to(jnp.asarray(limit, float), follows.shape)
+    return ILQR(first, K[..., 0, :], L[..., 0], 1.0 / follows, batch, limit)

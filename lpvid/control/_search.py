@@ -151,7 +151,10 @@ def no_multipliers(starts: int, constraints: int) -> Multipliers:
         constraints: how many each has.
     """
     return Multipliers(
-        jnp.zeros((starts, constraints)), jnp.full(starts, 10.0), jnp.full(starts, jnp.inf)
+        jnp.zeros((starts, constraints)),
+        # Typed, or the second round compiles everything again.
+        jnp.full(starts, 10.0, float),
+        jnp.full(starts, jnp.inf, float),
     )
 
 

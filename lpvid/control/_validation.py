@@ -11,7 +11,12 @@ from jaxtyping import Array, ArrayLike, Float
 from lpvid.analysis import relative_error
 from lpvid.control._closed_loop import ClosedLoopMotion, simulate_closed_loop
 from lpvid.data import IOData
-from lpvid.identify import AbstractSubspaceMethod, estimate_initial_state, identify
+from lpvid.identify import (
+    AbstractSubspaceMethod,
+    estimate_initial_state,
+    identify,
+    offset_level,
+)
 from lpvid.mechanics import ProportionalDerivative, SampledController, SingleLinkFlexibleArm
 from lpvid.models import LPVStateSpace, StateSpace
 
@@ -235,7 +240,7 @@ def _matched(item: Any, data: IOData, known: IOData) -> Array:
         parts.append(y)
     offset = getattr(item, "output_offset", None)
     simulated = jnp.concatenate(parts)
-    return simulated if offset is None else simulated + offset[None]
+    return simulated if offset is None else simulated + offset_level(jnp.asarray(offset), data)
 
 
 def _followed(item: Any, controller: SampledController, reference: Array, dt: float) -> Array:

@@ -200,13 +200,21 @@ def port_signals(
         records: inputs and times.
         trace: of the predictor.
     """
-    ends = {"before": trace.before, "start": trace.state, "end": trace.end}
+    moved = records.u + records.change
+    ends = {
+        "before": (records.u, trace.before),
+        "start": (records.u, trace.state),
+        "end": (moved, trace.end),
+    }
     return {
         name: {
-            key: np.asarray(value)
-            for key, value in _signals(matrices, weights, records.u, states).items()
+            "input": np.asarray(u),
+            **{
+                key: np.asarray(value)
+                for key, value in _signals(matrices, weights, u, states).items()
+            },
         }
-        for name, states in ends.items()
+        for name, (u, states) in ends.items()
     }
 
 
@@ -228,13 +236,13 @@ def signals_at(
         return signals[name][:, place.where] if place.port == port else nothing
 
     at_input = place.port == "input"
-    u, history = np.asarray(records.u), np.asarray(records.history)
+    history = np.asarray(records.history)
     leaves = {
         "position": pick("position", "force"),
         "velocity": pick("velocity", "force"),
         "acceleration": pick("acceleration", "force"),
         "load": pick("load", "force"),
-        "input": u[:, place.where] if at_input else nothing,
+        "input": pick("input", "input"),
         "output": pick("output", "output"),
         "time": np.asarray(records.time),
         "history": history[:, :, place.where] if at_input else np.zeros((count, HISTORY)),

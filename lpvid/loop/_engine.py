@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lpvid.data import IOData
-from lpvid.effects import LIBRARY, AbstractLaw
+from lpvid.effects import LIBRARY, AbstractLaw, InputDelay
 from lpvid.loop._assess import default_horizon, ladder, noise_in
 from lpvid.loop._bench import Bench
 from lpvid.loop._checks import checked_fit, checked_options, checked_records, checked_signals
@@ -74,7 +74,8 @@ def close_the_loop(
         most_effects: effects to add at most.
         horizon: samples of the horizon error; a twentieth of the held-out record if `None`.
         hold: what the inputs do between samples: "zero" where a converter holds them, "linear"
-            where they were measured and are band-limited.
+            where they were measured and are band-limited; the input delay, a law of held inputs, is
+            then left out.
         progress: whether a bar shows the rounds.
 
     Returns:
@@ -107,7 +108,8 @@ def close_the_loop(
     checked_signals(data, test)
     structure = _structure(model, data if test is not None else data.split(split)[0])
     checked_records(structure, data, test, split, horizon)
-    bench = _bench(structure, data, test, split, tuple(laws), hold)
+    kept = tuple(law for law in laws if hold == "zero" or not isinstance(law, InputDelay))
+    bench = _bench(structure, data, test, split, kept, hold)
     with tqdm(total=most_effects + 3, disable=not progress, desc="fitting") as bar:
         base = _base(bench)
         bar.update()
@@ -170,11 +172,14 @@ def _rounds(bench: Bench, base: Fitted, most: int, bar: tqdm) -> Rounds:
         bar.set_description(f"round {len(rankings) + 1}")
         ranking = rank(fitted, bench.train, bench.schedules)
         rankings.append(ranking)
-        if ranking.p_value > LEVEL or (chosen and _at_floor(bench, fitted)):
+        folded = None if chosen else folded_sensor(bench, fitted)
+        quiet = ranking.p_value > LEVEL or (chosen and _at_floor(bench, fitted))
+        if quiet and folded is None:
             return Rounds(fitted, chosen, rankings, unfruitful)
-        found = None if chosen else folded_sensor(bench, fitted, ranking)
-        if found is None:
-            found = choose(fitted, ranking, bench.train, bench.held_out)
+        found = choose(fitted, ranking, bench.train, bench.held_out)
+        if folded is not None and (found is None or folded.held_out_gain > found.held_out_gain):
+            found = folded
+            rankings[-1] = ranking._replace(p_value=min(ranking.p_value, folded.p_value))
         slower = max((one for one in RATIOS if one <= _SLOWER * fitted.ratio), default=None)
         if found is None and slower is not None:
             bar.set_description(f"round {len(rankings)}, slow gain")

@@ -3,7 +3,6 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
 
 from lpvid.data import IOData
 from lpvid.effects import AbsoluteValueSensor
@@ -15,8 +14,8 @@ from lpvid.loop._compare import better
 from lpvid.loop._program import Records
 from lpvid.loop._records import records_of
 from lpvid.loop._refit import Ranked, seated
-from lpvid.loop._rounds import Chosen, Ranking, held_out_errors, likelihood_on
-from lpvid.loop._score import Scored, family_wise
+from lpvid.loop._rounds import Chosen, held_out_errors, likelihood_on
+from lpvid.loop._score import Scored
 from lpvid.loop._tune import Fitted, empty_unknowns, fit
 from lpvid.loop._verdict import LEVEL
 from lpvid.loop.structures import unfolded
@@ -24,8 +23,8 @@ from lpvid.loop.structures import unfolded
 _TURNS = 5
 
 
-def folded_sensor(bench: Bench, base: Fitted, ranking: Ranking) -> Chosen | None:
-    """The model of the signal behind a folded output, the sensor on it; `None` if none is folded.
+def folded_sensor(bench: Bench, base: Fitted) -> Chosen | None:
+    """The model of the signal behind a folded output, the sensor on it; `None` if not just one is.
 
     A score test asks for small steps from the model as it is; that of y = |z| is far from any
     linear model of y. So the parameters are fitted to the straightened signal first.
@@ -33,12 +32,12 @@ def folded_sensor(bench: Bench, base: Fitted, ranking: Ranking) -> Chosen | None
     Args:
         bench: what the call works with.
         base: the model without effects.
-        ranking: of the first round, whose number of tests counts.
     """
     setting, train = bench.setting, bench.data[0]
     sensors = [k for k, law in enumerate(setting.laws) if isinstance(law, AbsoluteValueSensor)]
     straight, outputs = unfolded(train) if sensors else (train, ())
-    if not outputs:
+    # One sensor has one sign to settle; several would have to be seated together.
+    if len(outputs) != 1:
         return None
     place = Place(sensors[0], "output", outputs[0])
     behind, records = _behind(bench, base, straight, outputs[0])
@@ -57,15 +56,13 @@ def folded_sensor(bench: Bench, base: Fitted, ranking: Ranking) -> Chosen | None
         gain=behind.gain,
     )
     before, after = (
-        likelihood_on(base, held_out_errors(one, bench.held_out)) for one in (base, found)
+        likelihood_on(one, held_out_errors(one, bench.held_out)) for one in (base, found)
     )
     gain, p_value = better(before, after)
-    if not np.isfinite(gain) or p_value > LEVEL:
+    won = found.searched.log_likelihood - base.searched.log_likelihood
+    if not (np.isfinite(gain) and won > 0.0) or p_value > LEVEL:
         return None
-    won = max(found.searched.log_likelihood - base.searched.log_likelihood, 0.0)
-    scored = Scored(won, np.ones(1), float(scipy.stats.chi2.sf(2.0 * won, 1)))
-    promised = family_wise(scored.p_value, ranking.tests)
-    return Chosen(found, entry._replace(scored=scored), (), gain, promised)
+    return Chosen(found, entry._replace(scored=Scored(won, np.ones(1), p_value)), (), gain, p_value)
 
 
 def _behind(bench: Bench, base: Fitted, straight: IOData, output: int) -> tuple[Fitted, Records]:

@@ -11,6 +11,7 @@ from lpvid._results import Status
 from lpvid.control import ClosedLoopMotion
 from lpvid.data import IOData
 from lpvid.loop._assess import free_run, robust_covariance
+from lpvid.loop._checks import checked_fit
 from lpvid.loop._numbers import parameter_numbers, seated_effect
 from lpvid.loop._ported import AbstractPortedStructure
 from lpvid.loop._program import Feedback, Records
@@ -131,6 +132,7 @@ class LoopModel(NamedTuple):
 
         Raises:
             ValueError: channels or sample time do not suit.
+            DataError: the errors are not finite, as where an unstable model is simulated.
         """
         records, old = self._records(data), self.fitted
         begun = old._replace(unknowns=with_starts(old, records))
@@ -138,6 +140,7 @@ class LoopModel(NamedTuple):
             refined = refit(begun, records, old.ratio, old.ratios)
         else:
             refined = simulation_fit(begun, records)
+        checked_fit(refined.searched.log_likelihood, self.structure)
         return loop_model(refined, self.nodes, self.duration, self.schedules)
 
     def simulate_closed_loop(

@@ -106,6 +106,8 @@ def records_of(
     if kappa.shape[1]:
         middle, half = _range(nodes) if len(nodes) > 1 else (float(nodes[0, 0]), 1e-12)
         follow = np.concatenate([(kappa - middle) / max(half, 1e-12), follow], axis=1)
+    # Beyond what it was laid over, a schedule is held at its end.
+    follow = np.clip(follow, -1.0, 1.0)
     counts = np.ones(u.shape[0])
     change = np.zeros_like(u)
     if hold == "linear":

@@ -134,7 +134,8 @@ class Chosen(NamedTuple):
         entry: the candidate.
         confusable: places that the records cannot tell from it.
         held_out_gain: in log-likelihood.
-        p_value: family-wise, of the score test.
+        p_value: family-wise, of the score test; of a folded sensor, which no such test leads to,
+            that of the held-out gain.
     """
 
     fitted: Fitted

@@ -269,6 +269,8 @@ def with_starts(fitted: Fitted, records: Records, gain: Array | None = None) -> 
     first, *others = [
         _started(fitted, records, starts, gain) for starts in _rough_starts(fitted, records)
     ]
+    if not others:
+        return first.unknowns
     # Each record starts by the sign that suits it.
     starts, sizes = np.array(first.unknowns.start), _sizes(first, records)
     for other in others:
@@ -299,7 +301,9 @@ def _started(fitted: Fitted, records: Records, starts: Array, gain: Array | None
 def _sizes(found: Searched, records: Records) -> np.ndarray:
     """Sum of the squared errors of each record, infinite where they are not finite."""
     record = np.asarray(records.record)[: found.errors.shape[0]]
-    squares = np.sum((found.errors / np.std(np.asarray(records.y), axis=0)) ** 2, axis=1)
+    spread = np.maximum(np.std(np.asarray(records.y), axis=0), 1e-300)
+    with np.errstate(all="ignore"):
+        squares = np.sum((found.errors / spread) ** 2, axis=1)
     sizes = np.bincount(record, squares, minlength=records.memory.shape[0])
     return np.where(np.isfinite(sizes), sizes, np.inf)
 

@@ -56,7 +56,9 @@ class ModuleParameterisation(AbstractParameterisation):
     def _leaves(self) -> list[tuple[str, Array, int]]:
         """Name, array and place (among all leaves) of what is estimated."""
         paths = jax.tree_util.tree_leaves_with_path(self.model)
-        only = _ESTIMATED.get(type(self.model))
+        only = next(
+            (part for kind, part in _ESTIMATED.items() if isinstance(self.model, kind)), None
+        )
         found = []
         for place, (path, leaf) in enumerate(paths):
             name = jax.tree_util.keystr(path).lstrip(".")

@@ -117,9 +117,18 @@ def _without(record: Record, rest: Float[Array, " ny"]) -> Record:
 
 
 def without_constants(data: IOData, constants: Constants) -> IOData:
-    """Records whose outputs have lost their constants."""
+    """Records whose outputs have lost their constants.
+
+    Raises:
+        ValueError: constants of another number of records.
+    """
     if constants.ndim == 1:
         return data.replace(y=data.y - constants[None])
+    if constants.shape[0] != len(data.lengths):
+        raise ValueError(
+            f"output_offset: there are constants of {constants.shape[0]} records and "
+            f"{len(data.lengths)} records; give as many as the fit was made from."
+        )
     return data.replace(y=data.y - constants[np.repeat(range(len(data.lengths)), data.lengths)])
 
 

@@ -84,7 +84,9 @@ def refine(
             to all records, as `offset[k]`, or `"per record"`, one of each record r, as
             `offset[r,k]`; or known constants, (ny,) or (record, ny), such as the `y` of a
             `lpvid.data.Offset`. By default, what the fit that is refined did, so that an estimated
-            offset stays an unknown and the intervals of the gain account for it.
+            offset stays an unknown and the intervals of the gain account for it. Where offsets
+            differ, start from a model of records freed of their means: `identify` knows one offset
+            for all. Constants of each record belong to these records in this order.
         max_steps: limit on the trial steps.
         throw: raise where no fit came out. `False` returns it with its status, and warns.
 

@@ -8,6 +8,7 @@ import scipy.linalg
 
 from lpvid._results import Status
 from lpvid.control import (
+    ILQR,
     PDP,
     PDPC,
     ProportionalIntegral,
@@ -32,14 +33,18 @@ LAG = StateSpace([[-1.0]], [[2.0]], [[1.0]])
 GAINS = (0.8, 1.5)
 
 
-def by_hand(samples, *, limit=np.inf, late=0.0):
+def by_hand(samples, *, limit=np.inf, late=0.0, clamp=False):
     """PI on ẏ = −y + 2u, sample by sample; `late` is the delay as a share of the sample."""
     x, total, before, y, u = 0.0, 0.0, 0.0, [], []
     first, rest = np.exp(-late * DT), np.exp(-(1 - late) * DT)
     for _ in range(samples):
         error = 1.0 - x
-        total += DT * error
+        command = GAINS[0] * error + GAINS[1] * (total + DT * error)
+        # Clamped, the integral stands still while the error drives a cut command further out.
+        if not (clamp and abs(command) > limit and error * command > 0.0):
+            total += DT * error
         command = GAINS[0] * error + GAINS[1] * total
+        command = np.clip(command, -limit, limit) if clamp else command
         y.append(x)
         u.append(command)
         acting = np.clip(command, -limit, limit)
@@ -138,12 +143,47 @@ def test_the_arm_is_that_of_the_simulator():
         )
 
 
+def test_anti_windup_clamps_the_integral():
+    limited = ProportionalIntegral(*GAINS, dt=DT, limit=0.6)
+    found = simulate_closed_loop(LAG, limited, reference=np.ones(40), dt=DT)
+    y, u = by_hand(40, limit=0.6, clamp=True)
+    np.testing.assert_allclose(found.y[:, 0], y, atol=1e-12)
+    np.testing.assert_allclose(found.u[:, 0], u, atol=1e-12)
+    assert np.any(np.abs(u) == 0.6)
+    assert y.max() < by_hand(40, limit=0.6)[0].max() - 0.02
+    # An integral that returns from beyond the limit is let go.
+    error, beyond = jnp.array([-0.1]), jnp.array([1.0])
+    total, command = limited.step(beyond, error, jnp.zeros(4))
+    np.testing.assert_allclose(total, [0.99], atol=1e-12)
+    assert command == 0.6
+    with pytest.raises(ValueError, match="limit=0.0 must be positive"):
+        ProportionalIntegral(*GAINS, dt=DT, limit=0.0)
+
+
+def test_ilqr_observes_the_command_within_its_limit():
+    drift = StateSpace([[1.0]], [[1.0]], [[1.0]], dt=DT)
+    gains = {"feedback": [0.6], "observer": [0.5], "feedforward": 0.6, "integral": 1.0}
+    free, limited = ILQR(drift, **gains), ILQR(drift, **gains, limit=0.25)
+    start = jnp.array([0.2]), jnp.array([0.05])
+    for reference, clamps in ((0.1, False), (2.0, True), (-2.0, True)):
+        asked, y = jnp.array([reference]), jnp.array([0.3])
+        (x, total), command = limited.step(start, asked, y)
+        (_, summed), plain = free.step(start, asked, y)
+        kept = 0.05 if clamps else float(summed[0])
+        expected = np.clip(0.6 * reference + kept - 0.6 * 0.2, -0.25, 0.25)
+        if reference == 0.1:
+            np.testing.assert_allclose(plain, expected, atol=1e-12)
+        np.testing.assert_allclose(command, expected, atol=1e-12)
+        np.testing.assert_allclose(total, kept, atol=1e-12)
+        np.testing.assert_allclose(x, 0.2 + expected + 0.5 * (0.3 - 0.2), atol=1e-12)
+
+
 def test_pdp_and_pdpc_laws():
     pdp = PDP(0.5, 3.0, 0.1)
     y = jnp.array([2.0, 9.0, 0.4, 0.1])
     effort = 0.5 * (3.0 - 2.0) - 3.0 * 0.1 - 0.1 * 0.4
     np.testing.assert_allclose(pdp.step(None, jnp.array([3.0]), y)[1], [effort])
-    pdpc, always = PDPC(pdp), PDPC(pdp, conditional=False)
+    pdpc, always = PDPC(pdp), PDPC(pdp, rule="always")
 
     def added(controller, error, speed, strain=0.0):
         y = jnp.array([3.0 - error, 0.0, strain, speed])
@@ -166,6 +206,56 @@ def test_pdp_and_pdpc_laws():
     exact = PDPC(pdp, band=0.25)
     assert added(exact, 0.25, 0.0) == 0.7
     assert added(exact, 0.2499, 0.0) == 0.0
+
+
+def test_precise_compensation_goes_by_the_error_that_is_left():
+    pdp, step = PDP(0.5, 3.0, 0.1), 0.01
+    precise = PDPC(pdp, 0.8, rule="precise", resolution=step, averaging=4.0)
+    errors = step * np.repeat([2.0, 0.8, 0.6, 0.4, -0.9, -1.2, -0.7, 0.0], 30)
+    speeds = np.tile([0.0, 0.02], errors.size // 2)
+
+    def one(state, now):
+        error, speed = now
+        y = jnp.stack([3.0 - error, 0.0, 0.0, speed])
+        state, command = precise.step(state, jnp.array([3.0]), y)
+        return state, command[0] - pdp.step(None, jnp.array([3.0]), y)[1][0]
+
+    _, added = jax.lax.scan(one, precise.initial(), (jnp.asarray(errors), jnp.asarray(speeds)))
+    # Whatever speed and strain do: on from one step of the low-passed error, off at half of one.
+    at_end = np.asarray(added).reshape(8, 30)[:, -1]
+    np.testing.assert_allclose(at_end, 0.8 * np.array([1, 1, 1, 0, 0, -1, -1, 0]), atol=1e-9)
+    # Late by the low-pass: 2 steps (1 - 0.75^k) reach one step at k = 3.
+    np.testing.assert_allclose(np.asarray(added)[:4], [0.0, 0.0, 0.8, 0.8], atol=1e-9)
+    # Far away and moving it is the conditional law.
+    for y in ([2.0, 0.0, 0.0, 0.0], [3.1, 0.0, 0.0, 0.0], [3.0, 0.0, 0.0, 0.2]):
+        _, command = precise.step(precise.initial(), jnp.array([3.0]), jnp.array(y))
+        expected = PDPC(pdp, 0.8).step(None, jnp.array([3.0]), jnp.array(y))[1]
+        np.testing.assert_allclose(command, expected)
+    with pytest.raises(ValueError, match="at least one sample"):
+        PDPC(pdp, averaging=0.5)
+
+
+@pytest.mark.slow
+def test_precise_compensation_ends_within_a_quantisation_step_and_the_published_does_not():
+    arm, step = reference_single_link_arm(payload_mass=0.3, modes=1), Quantisation().step
+    effects = ArmEffects(friction=DryFriction(0.4), noise=0.005, quantisation=Quantisation())
+    left = {}
+    for rule in ("precise", "conditional"):
+        found = simulate_closed_loop(
+            arm,
+            PDPC(PDP(0.594, 4.266, 0.254), 0.8, rule=rule),
+            reference=2.0 * jnp.ones(7200),
+            dt=1 / 300,
+            effects=effects,
+            key=jax.random.key(5),
+            substeps=4,
+        )
+        angle = float(arm.angle_gain) * np.asarray(found.states)[-600:, 0]
+        left[rule] = abs(2.0 - angle.mean()) / step
+        # At rest there.
+        assert np.ptp(angle) < 0.1 * step
+    assert left["precise"] < 1.0
+    assert left["conditional"] > 2.0
 
 
 @pytest.mark.slow

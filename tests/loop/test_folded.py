@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.signal
 
 from lpvid.data import IOData
 from lpvid.loop import close_the_loop
@@ -52,6 +53,18 @@ def test_other_signals_are_left_alone(change):
         "noise alone": np.abs(noise),
     }[change]
     data = IOData(u=u, y=signal, dt=0.02)
+    assert unfolded(data) == (data, ())
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03, 0.05])
+def test_a_plant_that_rests_at_zero_is_left_alone(noise):
+    rng = np.random.default_rng(3)
+    u = np.zeros(1500)
+    for begin in range(100, 1500, 250):
+        u[begin : begin + 40] = rng.uniform(0.5, 1.0)
+    _, y, _ = scipy.signal.lsim(([25.0], [1.0, 10.0, 25.0]), u, 0.02 * np.arange(1500))
+    y = y + noise * np.sqrt(np.mean(y**2)) * rng.standard_normal(1500)
+    data = IOData(u=u, y=y, dt=0.02)
     assert unfolded(data) == (data, ())
 
 

@@ -8,11 +8,16 @@ from lpvid.data import IOData
 
 _LAGS = 4
 _PASSES = 20
+_PRICE = 3.0
+"""Of a change of sign, in variances of the prediction error."""
+
 _BELOW = 0.15
 """Share of the root mean square that noise may take a folded signal below zero by."""
 
 _CLEAR = 50.0
-"""Gain in log-likelihood from which a signal counts as folded."""
+"""Gain in log-likelihood, less the logarithm of the samples for each change of sign, from which a
+signal counts as folded: noise about zero gains by signs of its own choice, too, but little by
+each."""
 
 
 def unfolded(data: IOData) -> tuple[IOData, tuple[int, ...]]:
@@ -54,12 +59,15 @@ def _straight(u: np.ndarray, y: np.ndarray, lengths: tuple[int, ...]) -> np.ndar
     z = np.concatenate([_extrapolated(own) for _, own in pieces])
     coefficients, least = _model(z, pieces)
     for _ in range(_PASSES):
-        other = np.concatenate([_best_signs(own, u, coefficients) for u, own in pieces])
+        price = _PRICE * least
+        other = np.concatenate([_best_signs(own, u, coefficients, price) for u, own in pieces])
         fresh, error = _model(other, pieces)
         if error >= least:
             break
         z, coefficients, least = other, fresh, error
     gain = 0.5 * y.size * np.log(as_it_is / max(least, 1e-300))
+    turned = np.where(z == y, 1.0, -1.0)
+    gain -= np.log(y.size) * np.sum(np.diff(turned) != 0.0)
     return z if gain > _CLEAR else None
 
 
@@ -72,11 +80,11 @@ def _split(z: np.ndarray, pieces: Pieces) -> list[np.ndarray]:
 
 
 def _model(z: np.ndarray, pieces: Pieces) -> tuple[np.ndarray, float]:
-    """Coefficients of z on its past and the inputs, and the mean squared error."""
+    """Coefficients of z on its past, the inputs and one, and the mean squared error."""
     own = _split(z, pieces)
     design = np.concatenate(
         [
-            np.concatenate([_lagged(part[:, None], 1), _lagged(u, 0)], axis=1)
+            np.concatenate([_lagged(part[:, None], 1), _driving(u)], axis=1)
             for part, (u, _) in zip(own, pieces, strict=True)
         ]
     )
@@ -85,20 +93,21 @@ def _model(z: np.ndarray, pieces: Pieces) -> tuple[np.ndarray, float]:
     return coefficients, float(np.mean((target - design @ coefficients) ** 2))
 
 
-def _best_signs(y: np.ndarray, u: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """The samples with the signs that the model predicts with the least squared error."""
+def _best_signs(y: np.ndarray, u: np.ndarray, coefficients: np.ndarray, price: float) -> np.ndarray:
+    """The samples with the signs of the least squared error, and a price for each change."""
     # A state is the signs of the last samples, the latest in the lowest bit.
     states = np.arange(2**_LAGS)
     past = 1.0 - 2.0 * ((states[:, None] >> np.arange(_LAGS)[None]) & 1)
-    driven = _lagged(u, 0) @ coefficients[_LAGS:]
+    driven = _driving(u) @ coefficients[_LAGS:]
     earlier = np.stack([states >> 1, (states >> 1) | 2 ** (_LAGS - 1)])
     sign = past[:, 0]
+    change = price * (past[:, 0] != past[:, 1])
     cost = np.zeros(states.size)
     came = np.empty((len(y) - _LAGS, states.size), int)
     for k in range(_LAGS, len(y)):
         # Most recent first, as the coefficients are.
         ahead = past @ (coefficients[:_LAGS] * y[k - _LAGS : k][::-1]) + driven[k - _LAGS]
-        total = cost[earlier] + (sign[None] * y[k] - ahead[earlier]) ** 2
+        total = cost[earlier] + change[None] + (sign[None] * y[k] - ahead[earlier]) ** 2
         better = np.argmin(total, axis=0)
         came[k - _LAGS] = earlier[better, states]
         cost = total[better, states]
@@ -109,6 +118,10 @@ def _best_signs(y: np.ndarray, u: np.ndarray, coefficients: np.ndarray) -> np.nd
         state = came[k - _LAGS, state]
     signs[:_LAGS] = past[state, ::-1]
     return signs * y
+
+
+def _driving(u: np.ndarray) -> np.ndarray:
+    return np.concatenate([_lagged(u, 0), np.ones((len(u) - _LAGS, 1))], axis=1)
 
 
 def _lagged(signal: np.ndarray, first: int) -> np.ndarray:
